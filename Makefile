@@ -1,0 +1,59 @@
+# Everything from a bare machine with Python 3.10-3.13, make and a C compiler. Each target builds .venv when needed.
+PYTHON ?= python3
+EXTRAS ?= ros,train,tensorboard,test,colcon
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+# The environment is closed: nothing of a sourced ROS installation or another venv shines in.
+unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH COLCON_PREFIX_PATH
+ifdef _ROS_WHEELS_BOOTSTRAP_COMPLETE
+unexport LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
+endif
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.DEFAULT_GOAL := help
+.PHONY: help venv demo test test-slow lint format clean
+
+help:
+	@echo 'make demo       record experts, learn from their bags, drive the plant: out/demo'
+	@echo 'make test       the tests, without the slow ones'
+	@echo 'make test-slow  the slow ones'
+	@echo 'make lint       ruff and mypy'
+	@echo 'make format     let ruff format the code'
+	@echo 'make venv       build .venv only (EXTRAS=$(EXTRAS))'
+	@echo 'make clean      remove .venv, builds, caches and out/demo'
+
+venv: $(STAMP)
+
+# setuptools comes first: the package is then built with the tested version, not in isolation.
+$(STAMP): setup.py setup.cfg pyproject.toml package.xml requirements.lock
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; \
+	  sys.exit(None if (3, 10) <= v <= (3, 13) else "needs Python 3.10 to 3.13, %s is %d.%d: set PYTHON=" % (sys.executable, *v))'
+	@echo 'building $(VENV): about a minute, more when downloads are slow'
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install -q -c requirements.lock setuptools wheel
+	@$(BIN)/python -m pip install -q -c requirements.lock --no-build-isolation -e '.[$(EXTRAS)]'
+	@touch $@
+
+demo: $(STAMP)
+	$(BIN)/ems demo $(DEMO_ARGS)
+
+test: $(STAMP)
+	$(BIN)/python -m pytest -m 'not slow' $(PYTEST_ARGS)
+
+test-slow: $(STAMP)
+	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) build dist install log out/demo *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

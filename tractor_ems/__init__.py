@@ -1,0 +1,5 @@
+"""Energy management: policies, learning from bags, and the nodes and commands that run them."""
+
+from tractor_msgs_py import __version__
+
+__all__ = ["__version__"]
