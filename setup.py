@@ -8,7 +8,7 @@ import ast
 import os
 from pathlib import Path
 
-from setuptools import find_packages, setup
+from setuptools import Distribution, find_packages, setup
 
 from distutils.command.install_data import install_data  # isort: skip  (setuptools brings it)
 
@@ -49,6 +49,15 @@ class InstallDataAndLaunchers(install_data):
             self.outfiles.append(str(launcher))
 
 
+class DistributionWithData(Distribution):
+    """Make `pip install -e` install the data files too.
+
+    setuptools' editable build asks for has_data and silently skips them without it.
+    """
+
+    has_data = Distribution.has_data_files
+
+
 def version():
     """Read __version__ without importing the package."""
     for node in ast.parse((ROOT / "tractor_msgs_py" / "__init__.py").read_text()).body:
@@ -86,6 +95,7 @@ setup(
         *tree("tractor_sim/data", "data"),
         *tree("bags", "bags"),
     ],
+    distclass=DistributionWithData,
     cmdclass={"install_data": InstallDataAndLaunchers},
     zip_safe=False,
     install_requires=[
