@@ -1,0 +1,147 @@
+"""Rules that need no model of the future: conventional, best point, the paper's rule base, and
+myopic greedy.
+
+Each policy is a frozen dataclass of its settings; memory, where there is any, is its state.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tractor_ems.policies.protocol import ANY_RUN, limits_of
+from tractor_msgs_py.observation import Observation, ObservationSpec
+from tractor_msgs_py.trajectory import BoolArray, FloatArray
+from tractor_sim.engine import best_power_w, fuel_rate_kg_per_s
+from tractor_sim.generator import to_bus_w, to_crank_w
+from tractor_sim.powertrain import (
+    Command,
+    PowertrainParams,
+    battery_power_grid_w,
+    feasible_battery_power_w,
+    project,
+)
+
+NO_STATE = None
+
+
+def _command(battery_power_w: FloatArray, engine_off: BoolArray) -> Command:
+    return Command(battery_power_w, np.where(engine_off, 0.0, np.nan))
+
+
+@dataclass(frozen=True)
+class Conventional:
+    """The engine follows the load; the battery only helps above the engine's maximum."""
+
+    name: str = "conventional"
+    spec: ObservationSpec = ANY_RUN
+
+    def init(self, batch: int) -> None:
+        """No memory."""
+        return NO_STATE
+
+    def act(self, observation: Observation, state: None) -> tuple[Command, None]:
+        """Zero battery power, projected on the feasible set."""
+        demand_w = observation.power_demand_w
+        lb, ub = feasible_battery_power_w(limits_of(observation), demand_w)
+        return _command(project(np.zeros_like(demand_w), lb, ub), demand_w <= 0.0), state
+
+
+@dataclass(frozen=True)
+class BestPoint:
+    """The engine always at its best-efficiency power while SOC allows; the battery is the slack.
+
+    On "paper" this is nearly optimal, so a high score there proves little: every table shows it.
+    """
+
+    powertrain: PowertrainParams
+    name: str = "best_point"
+    spec: ObservationSpec = ANY_RUN
+
+    def init(self, batch: int) -> None:
+        """No memory."""
+        return NO_STATE
+
+    def act(self, observation: Observation, state: None) -> tuple[Command, None]:
+        """Battery power that leaves the engine its best power."""
+        engine = self.powertrain.engine
+        best_w = to_bus_w(
+            self.powertrain.generator, np.array(best_power_w(engine)), engine.power_max_w
+        )
+        demand_w = observation.power_demand_w
+        lb, ub = feasible_battery_power_w(limits_of(observation), demand_w)
+        return _command(project(demand_w - best_w, lb, ub), np.zeros(demand_w.shape, bool)), state
+
+
+@dataclass(frozen=True)
+class RuleBased:
+    """The paper's rule base: the engine carries demand above ``threshold_w``, the battery the
+    rest, with an SOC guard that can be switched off.
+
+    The guard (not in the paper) engages at SOC_min + ``guard_margin`` and holds until
+    ``guard_release`` above that: the engine then runs at its best power or the demand, whichever
+    is more, and the battery takes the surplus.
+    """
+
+    powertrain: PowertrainParams
+    threshold_w: float = 110e3
+    soc_guard: bool = True
+    guard_margin: float = 0.01
+    guard_release: float = 0.02
+    name: str = "rule_based"
+    spec: ObservationSpec = ANY_RUN
+
+    def init(self, batch: int) -> BoolArray:
+        """Guard not engaged, shape (B,)."""
+        return np.zeros(batch, dtype=bool)
+
+    def act(self, observation: Observation, state: BoolArray) -> tuple[Command, BoolArray]:
+        """Engine follows the load above the threshold, else off; the guard overrules."""
+        engine = self.powertrain.engine
+        demand_w = observation.power_demand_w
+        engage_soc = self.powertrain.battery.soc_min + self.guard_margin
+        engaged = np.where(
+            state, observation.soc < engage_soc + self.guard_release, observation.soc < engage_soc
+        )
+        guard = engaged & self.soc_guard
+        best_w = to_bus_w(
+            self.powertrain.generator, np.array(best_power_w(engine)), engine.power_max_w
+        )
+        engine_w = np.where(demand_w > self.threshold_w, demand_w, 0.0)
+        engine_w = np.where(guard, np.maximum(demand_w, best_w), engine_w)
+        lb, ub = feasible_battery_power_w(limits_of(observation), demand_w)
+        return _command(project(demand_w - engine_w, lb, ub), engine_w <= 0.0), engaged
+
+
+@dataclass(frozen=True)
+class MyopicGreedy:
+    """Least equivalent fuel of the present step, nothing of the future: fuel plus battery energy
+    at one fixed price.
+
+    The price is the engine's best specific fuel, the co-state of a lossless battery. It shows
+    how much of a learner's score needs no learning.
+    """
+
+    powertrain: PowertrainParams
+    actions: int = 1600
+    name: str = "myopic_greedy"
+    spec: ObservationSpec = ANY_RUN
+
+    def init(self, batch: int) -> None:
+        """No memory."""
+        return NO_STATE
+
+    def act(self, observation: Observation, state: None) -> tuple[Command, None]:
+        """Search the action grid, clipped to the feasible set."""
+        params = self.powertrain
+        engine, generator = params.engine, params.generator
+        price_kg_per_j = 1.0 / (max(engine.curve_efficiency) * engine.fuel_lhv_j_per_kg)
+        demand_w = observation.power_demand_w
+        lb, ub = feasible_battery_power_w(limits_of(observation), demand_w)
+        grid_w = battery_power_grid_w(params, self.actions)
+        candidates_w = project(grid_w[None, :], lb[:, None], ub[:, None])
+        engine_w = np.maximum(demand_w[:, None] - candidates_w, 0.0)
+        crank_w = to_crank_w(generator, engine_w, engine.power_max_w)
+        cost = fuel_rate_kg_per_s(engine, crank_w) + price_kg_per_j * candidates_w
+        chosen = np.argmin(cost, axis=1)[:, None]
+        battery_w = np.take_along_axis(candidates_w, chosen, axis=1)[:, 0]
+        return _command(battery_w, battery_w >= demand_w), state

@@ -1,0 +1,208 @@
+"""Samples to messages and back: the one place that knows message layouts.
+
+Decoding reads attributes only, so the same code serves rclpy's classes and those of the
+``rosbags`` reader. Encoding goes through a :class:`MessageFactory`
+(``tractor_msgs_py.ros.messages`` for rclpy). Changing a carrier type is a change of this file.
+"""
+
+import dataclasses
+import json
+import math
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from tractor_msgs_py import topics
+from tractor_msgs_py.errors import BagError
+from tractor_msgs_py.types import (
+    BatteryPowerCommand,
+    BatteryReading,
+    CommandMode,
+    PowerDemand,
+    PowertrainReading,
+    RunInfo,
+    Sample,
+)
+
+DEMAND_NAMES = ("power_demand",)
+COMMAND_NAMES = ("battery_power", "engine_power", "mode")
+POWERTRAIN_NAMES = (
+    "engine_on",
+    "time_in_state_s",
+    "engine_power",
+    "charge_limit",
+    "discharge_limit",
+    "engine_limit",
+    "applied_battery_power",
+    "applied_engine_power",
+    "fuel_kg",
+    "shortfall_j",
+    "dissipated_j",
+)
+
+
+class MessageFactory(Protocol):
+    """Builds messages of the three carrier types; one implementation per serialisation stack."""
+
+    def joint_state(self, stamp_ns: int, names: Sequence[str], efforts: Sequence[float]) -> Any:
+        """A JointState with header stamp, names and efforts."""
+
+    def battery_state(
+        self, stamp_ns: int, *, percentage: float, voltage: float, current: float
+    ) -> Any:
+        """A BatteryState whose unknown numeric fields are NaN."""
+
+    def string(self, data: str) -> Any:
+        """A std_msgs String."""
+
+
+def wire_soc(soc: Any) -> Any:
+    """SOC as a reader of ``battery_state`` sees it: rounded to float32, back as float64.
+
+    In-process runs pass observations through this so that they equal ROS runs bit for bit.
+    """
+    return np.asarray(soc, dtype=np.float32).astype(np.float64)
+
+
+def stamp_to_ns(stamp: Any) -> int:
+    """builtin_interfaces/Time to integer nanoseconds."""
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def _efforts(msg: Any, names: Sequence[str], topic: str) -> list[float]:
+    got = [str(name) for name in msg.name]
+    efforts = [float(value) for value in msg.effort]
+    if got != list(names) or len(efforts) != len(names):
+        raise BagError(
+            f"{topic}: JointState names {got} with {len(efforts)} efforts, "
+            f"expected {list(names)} with {len(names)}"
+        )
+    return efforts
+
+
+def encode_power_demand(sample: PowerDemand, factory: MessageFactory) -> Any:
+    """PowerDemand to a message."""
+    return factory.joint_state(sample.stamp_ns, DEMAND_NAMES, (sample.power_w,))
+
+
+def decode_power_demand(msg: Any) -> PowerDemand:
+    """Message to PowerDemand. Raises BagError on another layout."""
+    (power_w,) = _efforts(msg, DEMAND_NAMES, topics.POWER_DEMAND.name)
+    return PowerDemand(stamp_to_ns(msg.header.stamp), power_w)
+
+
+def encode_battery(sample: BatteryReading, factory: MessageFactory) -> Any:
+    """BatteryReading to a message; SOC, voltage and current become float32."""
+    return factory.battery_state(
+        sample.stamp_ns,
+        percentage=float(wire_soc(sample.soc)),
+        voltage=sample.voltage_v,
+        current=sample.current_a,
+    )
+
+
+def decode_battery(msg: Any) -> BatteryReading:
+    """Message to BatteryReading."""
+    return BatteryReading(
+        stamp_to_ns(msg.header.stamp),
+        float(np.float32(msg.percentage)),
+        float(msg.voltage),
+        float(msg.current),
+    )
+
+
+def encode_powertrain(sample: PowertrainReading, factory: MessageFactory) -> Any:
+    """PowertrainReading to a message."""
+    efforts = [float(value) for value in dataclasses.astuple(sample)[1:]]
+    return factory.joint_state(sample.stamp_ns, POWERTRAIN_NAMES, efforts)
+
+
+def decode_powertrain(msg: Any) -> PowertrainReading:
+    """Message to PowertrainReading. Raises BagError on another layout."""
+    engine_on, *rest = _efforts(msg, POWERTRAIN_NAMES, topics.POWERTRAIN.name)
+    return PowertrainReading(stamp_to_ns(msg.header.stamp), engine_on != 0.0, *rest)
+
+
+def encode_command(sample: BatteryPowerCommand, factory: MessageFactory) -> Any:
+    """BatteryPowerCommand to a message."""
+    efforts = (sample.battery_power_w, sample.engine_power_w, float(sample.mode))
+    return factory.joint_state(sample.stamp_ns, COMMAND_NAMES, efforts)
+
+
+def decode_command(msg: Any) -> BatteryPowerCommand:
+    """Message to BatteryPowerCommand. Powers may be non-finite: refusing them is the plant's job.
+
+    Raises BagError on another layout or an unknown mode.
+    """
+    battery_power_w, engine_power_w, mode = _efforts(msg, COMMAND_NAMES, topics.COMMAND.name)
+    if mode not in (0.0, 1.0, 2.0):
+        raise BagError(f"{topics.COMMAND.name}: mode {mode}, expected 0, 1 or 2")
+    return BatteryPowerCommand(
+        stamp_to_ns(msg.header.stamp), battery_power_w, engine_power_w, CommandMode(int(mode))
+    )
+
+
+def encode_run_info(sample: RunInfo, factory: MessageFactory) -> Any:
+    """RunInfo to a String holding JSON."""
+    return factory.string(json.dumps(dataclasses.asdict(sample), sort_keys=True, allow_nan=False))
+
+
+def decode_run_info(msg: Any) -> RunInfo:
+    """String to RunInfo. Raises BagError where a field is missing, mistyped or out of range.
+
+    Unknown keys are ignored, so that a newer writer stays readable.
+    """
+    where = topics.RUN_INFO.name
+    try:
+        data = json.loads(msg.data)
+    except ValueError as error:
+        raise BagError(f"{where}: not JSON ({error})") from None
+    if not isinstance(data, dict):
+        raise BagError(f"{where}: JSON {type(data).__name__}, expected an object")
+    values: dict[str, Any] = {}
+    for field in dataclasses.fields(RunInfo):
+        if field.name not in data:
+            if field.default is dataclasses.MISSING:
+                raise BagError(f"{where}: field {field.name} is missing")
+            continue
+        value: Any = data[field.name]
+        kind: Any = field.type
+        wrong = not isinstance(value, int | float) if kind is float else type(value) is not kind
+        if wrong or (kind is float and isinstance(value, bool)):
+            raise BagError(f"{where}: field {field.name} is {value!r}, expected {kind}")
+        values[field.name] = float(value) if kind is float else value
+    info = RunInfo(**values)
+    if not (math.isfinite(info.dt_s) and 0.0 < info.dt_s <= 3600.0):
+        raise BagError(f"{where}: dt_s {info.dt_s}, allowed 0 < dt_s <= 3600")
+    if info.t0_ns <= 0 or info.steps < 1:
+        raise BagError(f"{where}: t0_ns {info.t0_ns}, steps {info.steps}, both must be > 0")
+    for name in ("soc_initial", "soc_target"):
+        if not 0.0 <= getattr(info, name) <= 1.0:
+            raise BagError(f"{where}: {name} {getattr(info, name)}, allowed 0..1")
+    return info
+
+
+DECODERS = {
+    topics.POWER_DEMAND.name: decode_power_demand,
+    topics.BATTERY.name: decode_battery,
+    topics.POWERTRAIN.name: decode_powertrain,
+    topics.COMMAND.name: decode_command,
+    topics.RUN_INFO.name: decode_run_info,
+}
+"""Relative topic name to decoder."""
+
+
+def encode(sample: Sample, factory: MessageFactory) -> tuple[topics.Topic, Any]:
+    """Any sample to its topic and message."""
+    match sample:
+        case PowerDemand():
+            return topics.POWER_DEMAND, encode_power_demand(sample, factory)
+        case BatteryReading():
+            return topics.BATTERY, encode_battery(sample, factory)
+        case PowertrainReading():
+            return topics.POWERTRAIN, encode_powertrain(sample, factory)
+        case BatteryPowerCommand():
+            return topics.COMMAND, encode_command(sample, factory)
+        case RunInfo():
+            return topics.RUN_INFO, encode_run_info(sample, factory)

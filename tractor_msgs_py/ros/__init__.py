@@ -1,0 +1,1 @@
+"""The parts of the wire contract that need a ROS installation. Nothing pure imports this."""
