@@ -32,8 +32,8 @@ $(STAMP): setup.py setup.cfg pyproject.toml package.xml requirements.lock
 	  sys.exit(None if (3, 10) <= v <= (3, 13) else "needs Python 3.10 to 3.13, %s is %d.%d: set PYTHON=" % (sys.executable, *v))'
 	@echo 'building $(VENV): about a minute, more when downloads are slow'
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install -q -c requirements.lock setuptools
-	@$(BIN)/python -m pip install -q -c requirements.lock --no-build-isolation -e '.[$(EXTRAS)]'
+	@$(BIN)/python -m pip install -qq -c requirements.lock setuptools
+	@$(BIN)/python -m pip install -qq -c requirements.lock --no-build-isolation -e '.[$(EXTRAS)]'
 	@touch $@
 
 demo: $(STAMP)

@@ -67,5 +67,5 @@ def resource_path(kind: str, *parts: str) -> Path:
     folder = share / (kind if share != _source_root() else _SOURCE_FOLDERS[kind])
     path = folder.joinpath(*parts)
     if not path.exists():
-        raise ConfigError(f"no {kind} file {'/'.join(parts)!r}, looked in {folder}")
+        raise ConfigError(f"{'/'.join((kind, *parts))} not found, looked in {folder}")
     return path
