@@ -1,1 +1,1 @@
-"""The plant: engine, generator, battery and duty cycles of a series hybrid tractor, and its node."""
+"""The plant: engine, generator, battery and duty cycles of a series hybrid, and its node."""

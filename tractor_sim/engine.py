@@ -40,7 +40,7 @@ class EngineParams:
         power, efficiency = np.array(self.curve_power_w), np.array(self.curve_efficiency)
         if len(power) < 2 or len(power) != len(efficiency):
             raise ConfigError(
-                f"engine.curve: {len(power)} powers, {len(efficiency)} efficiencies, "
+                f"engine.curve_power_w: {len(power)} powers, {len(efficiency)} efficiencies, "
                 "at least 2 of each in equal number"
             )
         if power[0] != 0.0 or np.any(np.diff(power) <= 0):
