@@ -1,0 +1,20 @@
+"""The subcommands, wired."""
+
+import typer
+
+from tractor_ems.cli import bag, cycle, demo, dp, evaluate, train
+
+app = typer.Typer(
+    name="ems",
+    help="Energy management of series hybrid tractors: evaluate, optimise, learn from bags.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+    rich_markup_mode=None,
+)
+app.command("demo")(demo.demo)
+app.command("train")(train.train)
+app.command("evaluate")(evaluate.evaluate)
+app.command("dp")(dp.dp)
+app.add_typer(cycle.app, name="cycle")
+app.add_typer(bag.app, name="bag")

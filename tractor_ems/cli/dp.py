@@ -1,0 +1,52 @@
+"""``ems dp``: the optimum of one cycle, and its certificate."""
+
+from typing import Annotated
+
+import typer
+
+from tractor_ems.cli.evaluate import Cycle, Powertrain, Soc0
+from tractor_ems.cli.output import (
+    RESULT_COLUMNS,
+    JsonFlag,
+    print_json,
+    print_table,
+    result_row,
+)
+
+
+def dp(
+    powertrain: Powertrain = "paper",
+    cycle: Cycle = "planter",
+    soc0: Soc0 = None,
+    soc_final: Annotated[
+        float | None, typer.Option(help="SOC to end at; default the powertrain's target, or soc0.")
+    ] = None,
+    certify: Annotated[
+        bool, typer.Option(help="Halve every grid step until the fuel stands; report the gaps.")
+    ] = False,
+    json: JsonFlag = False,
+) -> None:
+    """Solve a cycle by dynamic programming and roll the optimum out on the real plant."""
+    from tractor_ems.evaluate import evaluate
+    from tractor_ems.scenario import make_scenario
+
+    scenario = make_scenario(powertrain, cycle, soc0, soc_final)
+    result, _ = evaluate("dp", scenario)
+    document = result.to_json()
+    if certify:
+        from tractor_ems.optimal.certificate import certify as certify_dp
+
+        certificate = certify_dp(
+            scenario.params,
+            scenario.power_demand_w,
+            soc_initial=scenario.soc_initial,
+            soc_final=scenario.soc_target,
+        )
+        document["certificate"] = certificate.to_json()
+    if json:
+        print_json(document)
+        return
+    print_table("", RESULT_COLUMNS, [result_row(document)])
+    if certify:
+        rows = list(document["certificate"].items())
+        print_table("certificate", ("quantity", "value"), rows)

@@ -1,0 +1,88 @@
+"""Drive one policy over one scenario, in-process or through the real nodes, and score it."""
+
+from pathlib import Path
+
+from tractor_ems.drive import drive
+from tractor_ems.optimal.score import dp_ratio
+from tractor_ems.policies.registry import make_policy, policy_file
+from tractor_ems.result import Result, Transport, summarise
+from tractor_ems.scenario import Scenario
+from tractor_msgs_py.trajectory import Trajectory
+
+
+def evaluate(
+    policy: str,
+    scenario: Scenario,
+    *,
+    transport: Transport = "in_process",
+    record: Path | None = None,
+    allow_other_powertrain: bool = False,
+) -> tuple[Result, Trajectory]:
+    """Drive and score.
+
+    Args:
+        policy: a name of ``policies.registry`` or a policy file.
+        scenario: what to drive.
+        transport: ``ros`` starts plant_sim and the policy node as processes in lockstep; the
+            trajectory hash is the same.
+        record: folder of a new bag that receives the run; None records nothing.
+        allow_other_powertrain: let a learned policy drive a powertrain it was not made for.
+
+    Raises:
+        TractorEmsError: bad input, or a run that was aborted.
+    """
+    made = make_policy(policy, scenario, allow_other_powertrain=allow_other_powertrain)
+    if transport == "ros":
+        from tractor_ems.ros_run import run_ros
+
+        trajectory = run_ros(
+            _policy_arguments(policy, scenario, allow_other_powertrain), scenario, record=record
+        )
+    elif record is not None:
+        from tractor_ems.bags.in_process import record_in_process
+
+        trajectory = record_in_process(made, scenario, record)
+    else:
+        trajectory = drive(
+            made,
+            scenario.params,
+            scenario.power_demand_w[None, :],
+            scenario.soc_initial,
+            scenario.soc_target,
+        )[0]
+    return score(made.name, scenario, trajectory, transport), trajectory
+
+
+def score(policy: str, scenario: Scenario, trajectory: Trajectory, transport: Transport) -> Result:
+    """The result row of a finished run, with its matched-SOC DP ratio."""
+    ratio = dp_ratio(
+        scenario.params,
+        trajectory.power_demand_w,
+        float(trajectory.soc[0]),
+        trajectory.soc_final,
+        float(trajectory.fuel_kg.sum()),
+        shortfall_j=float(trajectory.shortfall_j.sum()),
+    )
+    return summarise(
+        trajectory,
+        policy=policy,
+        cycle=scenario.cycle,
+        params=scenario.params,
+        soc_target=scenario.soc_target,
+        transport=transport,
+        dp_ratio=ratio,
+    )
+
+
+def _policy_arguments(
+    policy: str, scenario: Scenario, allow_other: bool
+) -> tuple[str, dict[str, object]]:
+    """Node executable and its parameters for a policy named by the user."""
+    if policy == "dp":
+        return "dp_policy", {}
+    if policy in ("conventional", "rule_based", "best_point", "myopic_greedy"):
+        return "rule_based_policy", {"policy": policy, "powertrain": scenario.powertrain_source}
+    return "ddqn_policy", {
+        "policy_file": str(policy_file(policy, scenario.params.name).resolve()),
+        "allow_other_powertrain": allow_other,
+    }

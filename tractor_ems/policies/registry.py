@@ -1,0 +1,60 @@
+"""Policies by the names people use in commands and tables."""
+
+from pathlib import Path
+
+from tractor_ems.policies.protocol import Policy
+from tractor_ems.policies.rules import BestPoint, Conventional, MyopicGreedy, RuleBased
+from tractor_ems.scenario import Scenario
+from tractor_msgs_py.errors import PolicyError
+from tractor_sim.powertrain_json import powertrain_hash
+from tractor_sim.resources import resource_path
+
+RULES = ("conventional", "rule_based", "best_point", "myopic_greedy")
+NAMES = (*RULES, "dp", "default")
+
+
+def policy_file(name: str, powertrain: str) -> Path:
+    """The file behind ``default`` (shipped, by powertrain name) or a path.
+
+    Raises:
+        PolicyError: no policy ships for that powertrain, or the name is unknown.
+    """
+    if name == "default":
+        path = resource_path("data", "policy") / f"{powertrain}.safetensors"
+        if not path.is_file():
+            raise PolicyError(f"policy default: none ships for powertrain {powertrain!r}")
+        return path
+    if not name.endswith(".safetensors"):
+        raise PolicyError(
+            f"policy {name!r}: unknown, names are {', '.join(NAMES)}; or give a .safetensors file"
+        )
+    return Path(name)
+
+
+def make_policy(name: str, scenario: Scenario, *, allow_other_powertrain: bool = False) -> Policy:
+    """A policy ready to drive ``scenario``.
+
+    Raises:
+        PolicyError: unknown name, unreadable file, or a file made for another powertrain.
+    """
+    params = scenario.params
+    if name == "conventional":
+        return Conventional()
+    if name == "rule_based":
+        return RuleBased(params)
+    if name == "best_point":
+        return BestPoint(params)
+    if name == "myopic_greedy":
+        return MyopicGreedy(params)
+    if name == "dp":
+        from tractor_ems.policies.dp import solve_policy
+
+        return solve_policy(
+            params, scenario.power_demand_w, scenario.soc_initial, scenario.soc_target
+        )
+    from tractor_ems.policies.q_policy import check_powertrain, load_policy
+
+    policy = load_policy(policy_file(name, params.name))
+    if not allow_other_powertrain:
+        check_powertrain(policy, powertrain_hash(params))
+    return policy

@@ -1,0 +1,79 @@
+"""What is driven: powertrain, cycle, initial SOC and target, from the words a user types."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tractor_msgs_py.errors import ConfigError, CycleError
+from tractor_msgs_py.trajectory import FloatArray
+from tractor_sim.config import load_powertrain
+from tractor_sim.duty_cycle.cycle import DutyCycle
+from tractor_sim.duty_cycle.library import load_cycle
+from tractor_sim.powertrain import PowertrainParams
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A cycle on a powertrain, and where SOC starts and should end.
+
+    ``powertrain_source`` and ``cycle_source`` are what the user named, for the nodes.
+    """
+
+    params: PowertrainParams
+    cycle: DutyCycle
+    soc_initial: float
+    soc_target: float
+    powertrain_source: str
+    cycle_source: str
+
+    @property
+    def power_demand_w(self) -> FloatArray:
+        """Demand at the bus, auxiliaries included, shape (T,) [W]."""
+        return self.cycle.power_demand_w + self.params.p_aux_w
+
+
+def make_scenario(
+    powertrain: str,
+    cycle: str,
+    soc_initial: float | None = None,
+    soc_target: float | None = None,
+) -> Scenario:
+    """Resolve names and files.
+
+    Args:
+        powertrain: shipped name or YAML file.
+        cycle: shipped name, CSV file or bag folder.
+        soc_initial: None: the powertrain's.
+        soc_target: None: the powertrain's, or else the initial SOC.
+
+    Raises:
+        ConfigError: unknown powertrain, or a SOC outside its window.
+        CycleError: unknown or malformed cycle, or one of another step length.
+        BagError: the bag cannot be read or holds no demand.
+    """
+    params = load_powertrain(powertrain)
+    duty_cycle = resolve_cycle(cycle)
+    if abs(duty_cycle.dt_s - params.dt_s) > 1e-9:
+        raise CycleError(
+            f"cycle {duty_cycle.name}: dt_s {duty_cycle.dt_s}, powertrain {params.name} "
+            f"steps by {params.dt_s} s"
+        )
+    initial = params.soc_initial if soc_initial is None else soc_initial
+    default_target = initial if params.soc_target is None else params.soc_target
+    target = default_target if soc_target is None else soc_target
+    battery = params.battery
+    for name, value in (("soc0", initial), ("soc target", target)):
+        if not (np.isfinite(value) and battery.soc_min <= value <= battery.soc_max):
+            raise ConfigError(f"{name}: {value}, allowed {battery.soc_min}..{battery.soc_max}")
+    return Scenario(params, duty_cycle, initial, target, powertrain, cycle)
+
+
+def resolve_cycle(text: str) -> DutyCycle:
+    """A cycle by shipped name, CSV file, or bag (its power demand less the auxiliaries)."""
+    path = Path(text)
+    if path.is_dir() or path.suffix == ".mcap":
+        from tractor_ems.bags.transitions import cycle_of_bag
+
+        return cycle_of_bag(path)
+    return load_cycle(text)
