@@ -12,15 +12,15 @@ ANY_RUN = ObservationSpec()
 
 
 class Policy(Protocol):
-    """A decision maker. The same object runs in-process and in a node.
+    """A decision maker. The same object runs in-process and in a node."""
 
-    Attributes:
-        name: what result tables call it.
-        spec: what it needs to see.
-    """
+    @property
+    def name(self) -> str:
+        """What result tables call it."""
 
-    name: str
-    spec: ObservationSpec
+    @property
+    def spec(self) -> ObservationSpec:
+        """What it needs to see."""
 
     def init(self, batch: int) -> Any:
         """State before the first tick of B runs."""
