@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tractor_ems.drive import drive
-from tractor_ems.fuel import gallons
+from tractor_sim.fuel import gallons
 from tractor_ems.policies.rules import BestPoint, Conventional, MyopicGreedy, RuleBased
 from tractor_ems.result import count_violations, summarise
 from tractor_msgs_py.trajectory import trajectory_hash
