@@ -111,23 +111,22 @@ def write_trajectory_bag(
 
 
 def write_samples_bag(out: Path, samples: list[Sample], provenance: dict[str, str]) -> None:
-    """Write samples in the given order; each is logged at its stamp, run_info at the next one's.
+    """Write samples in the given order, each logged at its stamp, run_info at that before it.
 
     Raises:
         BagError: ``out`` exists already or cannot be written.
     """
     factory = RosbagsMessages()
-    used = {encode(sample, factory)[0].name for sample in samples}
+    encoded = [(sample, *encode(sample, factory)) for sample in samples]
+    used = {topic.name for _, topic, _ in encoded}
     channels = {name: topic for name, topic in _CHANNELS.items() if topic.name in used}
     sequence = dict.fromkeys(channels, 0)
     log_time_ns = min(s.stamp_ns for s in samples if not isinstance(s, RunInfo))
     with BagWriter(out, channels, provenance) as bag:
-        for sample in samples:
-            topic, message = encode(sample, factory)
+        for sample, topic, message in encoded:
             name = f"/{topic.name}"
             sequence[name] += 1
             if not isinstance(sample, RunInfo):
                 log_time_ns = sample.stamp_ns
-            bag.write(
-                name, serialize(message, topic.type), log_time_ns, log_time_ns, sequence[name]
-            )
+            data = serialize(message, topic.type)
+            bag.write(name, data, log_time_ns, log_time_ns, sequence[name])

@@ -5,6 +5,7 @@ instead; both go through the same codec.
 """
 
 import math
+import struct
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
@@ -50,6 +51,18 @@ def deserialize(data: bytes, type_name: str) -> Any:
         return typestore().deserialize_cdr(data, type_name)
     except Exception as error:  # generated code: a malformed message can raise almost anything
         raise BagError(f"{len(data)} bytes are not a {type_name} ({error!r})") from None
+
+
+def header_stamp_ns(data: bytes) -> int:
+    """Stamp of a message that begins with a std_msgs/Header, without decoding the rest.
+
+    Raises:
+        BagError: the bytes are too short for one.
+    """
+    if len(data) < 12:
+        raise BagError(f"{len(data)} bytes hold no message with a header")
+    sec, nanosec = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
+    return int(sec) * 1_000_000_000 + int(nanosec)
 
 
 class RosbagsMessages:
