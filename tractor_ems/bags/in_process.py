@@ -4,6 +4,7 @@ and finaliser as a recording of the nodes, without ROS.
 Equal runs give equal bytes: times are the stamps, and the run id follows from the content.
 """
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from tractor_ems.bags.rosbags_messages import RosbagsMessages, serialize
@@ -14,14 +15,12 @@ from tractor_ems.scenario import Scenario
 from tractor_msgs_py import __version__, topics
 from tractor_msgs_py.codec import encode
 from tractor_msgs_py.errors import BagError
-from tractor_msgs_py.trajectory import Trajectory, trajectory_hash
-from tractor_msgs_py.types import BatteryPowerCommand, RunInfo, Sample
+from tractor_msgs_py.trajectory import FloatArray, IntArray, Trajectory, trajectory_hash
+from tractor_msgs_py.types import BatteryPowerCommand, PowerDemand, RunInfo, Sample
 from tractor_sim.duty_cycle.cycle import cycle_hash
 from tractor_sim.plant_run import PlantRun
 from tractor_sim.powertrain import PowertrainParams
 from tractor_sim.powertrain_json import powertrain_hash
-
-_CHANNELS = {f"/{topic.name}": topic for topic in topics.RECORDED}
 
 
 def record_in_process(
@@ -72,46 +71,62 @@ def write_trajectory_bag(
     info: RunInfo,
     trajectory: Trajectory,
     policy: str = "",
-    written_steps: int | None = None,
 ) -> None:
     """Write a run that was driven in-process as a bag.
-
-    The commands are driven on the plant once more, because the messages hold more of its state
-    than a trajectory does. ``written_steps`` stops early, as an aborted run does.
 
     Raises:
         BagError: ``out`` exists already or cannot be written, or ``params`` do not reproduce
             the trajectory.
     """
+    samples, again = samples_of(params, info, trajectory)
+    if trajectory_hash(again) != trajectory_hash(trajectory):
+        raise BagError(f"{out}: powertrain {params.name} does not reproduce the trajectory")
+    provenance = {"recorder": "in_process", "command_line": info.command_line}
+    write_samples_bag(out, samples, {**provenance, f"policy:{info.run_id}": policy})
+
+
+def samples_of(
+    params: PowertrainParams, info: RunInfo, trajectory: Trajectory
+) -> tuple[list[Sample], Trajectory]:
+    """Everything plant and policy say during a run, in order, and the trajectory once more.
+
+    The commands are driven on the plant again: messages hold more of its state than a
+    trajectory does.
+    """
     run = PlantRun(params, info, trajectory.power_demand_w)
-    steps = len(trajectory) if written_steps is None else written_steps
-    pairs = zip(
+    samples: list[Sample] = [info]
+    for battery_power_w, engine_power_w in zip(
         trajectory.command_battery_power_w.tolist(),
         trajectory.command_engine_power_w.tolist(),
         strict=True,
-    )
-    sent: list[Sample] = [info]
-    for battery_power_w, engine_power_w in [*pairs][:steps]:
+    ):
         command = BatteryPowerCommand(run.stamp_ns, battery_power_w, engine_power_w)
-        sent += [*run.samples(), command]
+        samples += [*run.samples(), command]
         run.apply(command)
-    sent += run.samples()
-    again = run.trajectory()
-    if steps == len(trajectory) and trajectory_hash(again) != trajectory_hash(trajectory):
-        raise BagError(f"{out}: powertrain {params.name} does not reproduce the trajectory")
-    write_samples_bag(
-        out,
-        sent,
-        {
-            "recorder": "in_process",
-            "command_line": info.command_line,
-            f"policy:{info.run_id}": policy,
-        },
-    )
+    return [*samples, *run.samples()], run.trajectory()
 
 
-def write_samples_bag(out: Path, samples: list[Sample], provenance: dict[str, str]) -> None:
+def write_demand_bag(
+    out: Path, stamp_ns: IntArray, power_demand_w: FloatArray, namespace: str = ""
+) -> None:
+    """Write a recording of demand alone, both of shape (T,), as a vehicle without the stack
+    would leave it.
+
+    Raises:
+        BagError: ``out`` exists already or cannot be written.
+    """
+    pairs = zip(stamp_ns.tolist(), power_demand_w.tolist(), strict=True)
+    samples: list[Sample] = [PowerDemand(stamp, power_w) for stamp, power_w in pairs]
+    write_samples_bag(out, samples, {"recorder": "in_process"}, namespace)
+
+
+def write_samples_bag(
+    out: Path, samples: Sequence[Sample], provenance: Mapping[str, str], namespace: str = ""
+) -> None:
     """Write samples in the given order, each logged at its stamp, run_info at that before it.
+
+    Args:
+        namespace: of the topics, for instance ``/tractor1``.
 
     Raises:
         BagError: ``out`` exists already or cannot be written.
@@ -119,12 +134,12 @@ def write_samples_bag(out: Path, samples: list[Sample], provenance: dict[str, st
     factory = RosbagsMessages()
     encoded = [(sample, *encode(sample, factory)) for sample in samples]
     used = {topic.name for _, topic, _ in encoded}
-    channels = {name: topic for name, topic in _CHANNELS.items() if topic.name in used}
+    channels = {f"{namespace}/{t.name}": t for t in topics.RECORDED if t.name in used}
     sequence = dict.fromkeys(channels, 0)
     log_time_ns = min(s.stamp_ns for s in samples if not isinstance(s, RunInfo))
     with BagWriter(out, channels, provenance) as bag:
         for sample, topic, message in encoded:
-            name = f"/{topic.name}"
+            name = f"{namespace}/{topic.name}"
             sequence[name] += 1
             if not isinstance(sample, RunInfo):
                 log_time_ns = sample.stamp_ns

@@ -175,6 +175,9 @@ class _Draft:
         )
 
     def add(self, sample: StampedSample) -> None:
+        if 0 < sample.stamp_ns < self.latest_ns.get(type(sample), 0):
+            self.refusals["stamp_backwards"] += 1
+            return
         if sample.stamp_ns > 0:
             self.latest_ns[type(sample)] = sample.stamp_ns
         if isinstance(sample, BatteryPowerCommand) and sample.mode is not CommandMode.NOMINAL:

@@ -37,7 +37,7 @@ class Trace:
     Attributes:
         stamp_ns: t_k, shape (T,).
         power_demand_w: demand at the bus, auxiliaries included, shape (T,).
-        dt_s: step length; of a demand-only trace the median stamp interval.
+        dt_s: step length; without run_info the median stamp interval, to the millisecond.
         p_aux_w: auxiliary power within the demand; 0 where no run_info says so.
         soc: observed SOC at t_0 .. t_T with float32 resolution, shape (T + 1,).
         battery_power_w, engine_power_w: applied over step k, at the bus, shape (T,).
@@ -205,6 +205,25 @@ def transitions_of(traces: Iterable[Trace]) -> Transitions:
     )
 
 
+def trace_json(trace: Trace) -> dict[str, Any]:
+    """Where a trace comes from and how long it is, as plain data."""
+    return {
+        "bag": trace.bag,
+        "bag_hash": trace.bag_hash,
+        "run_id": trace.run_id or None,
+        "cycle": trace.cycle or None,
+        "powertrain": trace.powertrain or None,
+        "policy": trace.policy or None,
+        "steps": len(trace),
+        "dt_s": trace.dt_s,
+        "demand_only": trace.demand_only,
+        "from_start": trace.from_start,
+        "to_end": trace.to_end,
+        "irregular": trace.irregular,
+        "refusals": trace.refusals,
+    }
+
+
 _FLAGS = ("engine_on", "next_engine_on", "truncated")
 _NONE: dict[str, NDArray[Any]] = {
     field.name: np.zeros(0, dtype=bool if field.name in _FLAGS else np.float64)
@@ -262,7 +281,7 @@ def _demand_traces(run: Run, bag: str, digest: str) -> list[Trace]:
     if len(stamp_ns) < 2:
         return []
     intervals_ns = np.diff(stamp_ns)
-    dt_s = float(np.median(intervals_ns)) / 1e9 if info is None else info.dt_s
+    dt_s = round(float(np.median(intervals_ns)) / 1e9, 3) if info is None else info.dt_s
     cuts = np.flatnonzero(np.abs(intervals_ns * 1e-9 - dt_s) > GAP * dt_s) + 1
     edges = [0, *cuts.tolist(), len(stamp_ns)]
     return [
