@@ -1,0 +1,215 @@
+"""Settings of a training run, checked where they are made; presets are config/training/*.yaml."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
+
+from tractor_ems.learning.rewards import RewardConfig
+from tractor_msgs_py.errors import ConfigError
+from tractor_sim.config import describe
+from tractor_sim.resources import resource_path
+
+_STRICT = ConfigDict(extra="forbid")
+
+Count = Annotated[int, Field(ge=1, le=100_000_000)]
+Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+Discount = Annotated[float, Field(ge=0.0, lt=1.0)]
+Rate = Annotated[float, Field(gt=0.0, le=1.0)]
+Seconds = Annotated[float, Field(gt=0.0, le=86_400.0)]
+Widths = Annotated[tuple[Annotated[int, Field(ge=1, le=4096)], ...], Field(min_length=1)]
+ActivationName = Literal["relu", "tanh"]
+LossName = Literal["huber", "mse"]
+
+
+@dataclass(frozen=True, config=_STRICT)
+class CounterfactualConfig:
+    """Double Q-learning on the post-decision value, all actions of every sample.
+
+    Attributes:
+        updates: gradient steps.
+        batch: samples (bag, time, SOC, target) per step; both engine states of each are used.
+        learning_rate: of Adam, held for ``hold_fraction`` of the updates, then lowered along a
+            cosine to ``final_fraction`` of it.
+        gamma: discount per step.
+        target_rate: share of the online net that the target net takes over per update.
+        double: choose with the online net, evaluate with the target net; else the target net
+            does both.
+        loss: on the value error in cost units (10 g).
+        hidden, activation: of the network.
+    """
+
+    updates: Count = 3000
+    batch: Count = 256
+    learning_rate: Rate = 2e-3
+    hold_fraction: Fraction = 0.5
+    final_fraction: Fraction = 0.02
+    gamma: Discount = 0.98
+    target_rate: Rate = 0.01
+    double: bool = True
+    loss: LossName = "mse"
+    hidden: Widths = (64, 64)
+    activation: ActivationName = "tanh"
+
+
+@dataclass(frozen=True, config=_STRICT)
+class SampledConfig:
+    """Double DQN on replayed transitions, the paper's way.
+
+    Attributes:
+        updates: gradient steps.
+        batch: transitions per step.
+        learning_rate: of Adam, with the same schedule as in ``CounterfactualConfig``.
+        gamma: discount per step.
+        target_rate: soft update per step; 1 with ``target_every`` above 1 is a hard copy.
+        target_every: updates between target updates.
+        double: double DQN; False is plain DQN.
+        loss: on the temporal difference in reward units.
+        hidden, activation: of the network; its head has one output per action.
+        replay_capacity: transitions in the FIFO.
+        dp_share, rule_share: share of the capacity seeded from DP and rule-based bags.
+        epsilon_start, epsilon_end: exploration of simulated episodes, linear over them.
+    """
+
+    updates: Count = 20_000
+    batch: Count = 64
+    learning_rate: Rate = 1e-3
+    hold_fraction: Fraction = 0.5
+    final_fraction: Fraction = 0.02
+    gamma: Discount = 0.98
+    target_rate: Rate = 0.01
+    target_every: Count = 1
+    double: bool = True
+    loss: LossName = "huber"
+    hidden: Widths = (64, 64)
+    activation: ActivationName = "relu"
+    replay_capacity: Count = 200_000
+    dp_share: Fraction = 0.25
+    rule_share: Fraction = 0.0
+    epsilon_start: Fraction = 1.0
+    epsilon_end: Fraction = 0.05
+
+
+@dataclass(frozen=True, config=_STRICT)
+class TrainConfig:
+    """One training run; everything that decides its result besides the bags.
+
+    Attributes:
+        targets: ``counterfactual`` (the plant is known, demand exogenous: all actions of every
+            recorded step) or ``sampled`` (replayed transitions).
+        reward: see ``rewards.RewardConfig``.
+        powertrain: shipped name or YAML file.
+        allow_other_powertrain: use bags recorded on another powertrain.
+        seed: of every generator.
+        actions: size of the battery-power grid; 1600 is the paper's.
+        interact: simulated episodes to add.
+        mean_prior_s, low_pass_s: demand filters that the policy sees.
+        counterfactual, sampled: settings of the two modes.
+        checkpoint_every: updates between checkpoints; the last one is always kept.
+    """
+
+    targets: Literal["counterfactual", "sampled"] = "counterfactual"
+    reward: RewardConfig = RewardConfig()
+    powertrain: str = "paper"
+    allow_other_powertrain: bool = False
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    actions: Annotated[int, Field(ge=2, le=30_000)] = 1600
+    interact: Annotated[int, Field(ge=0, le=1_000_000)] = 0
+    mean_prior_s: Seconds = 120.0
+    low_pass_s: Seconds = 8.0
+    counterfactual: CounterfactualConfig = CounterfactualConfig()
+    sampled: SampledConfig = SampledConfig()
+    checkpoint_every: Count = 1000
+
+    @property
+    def updates(self) -> int:
+        """Gradient steps of the chosen mode."""
+        return self.mode.updates
+
+    @property
+    def mode(self) -> CounterfactualConfig | SampledConfig:
+        """Settings of the chosen mode."""
+        return self.counterfactual if self.targets == "counterfactual" else self.sampled
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data, for policy files and checkpoints."""
+        return asdict(self)
+
+
+def learning_rate(mode: CounterfactualConfig | SampledConfig, step: int) -> float:
+    """Learning rate of update number ``step`` (from 0): held, then a cosine down."""
+    begin = mode.hold_fraction * mode.updates
+    if step <= begin:
+        return mode.learning_rate
+    done = min((step - begin) / (mode.updates - begin), 1.0)
+    low = mode.final_fraction
+    return mode.learning_rate * (low + (1.0 - low) * 0.5 * (1.0 + math.cos(math.pi * done)))
+
+
+def load_train_config(
+    preset: str | Path | None = None, overrides: Mapping[str, Any] | None = None
+) -> TrainConfig:
+    """A preset by name (``config/training/NAME.yaml``) or YAML file, with overrides on top.
+
+    Args:
+        preset: None: the defaults.
+        overrides: nested like the file, or by dotted name: ``{"sampled.updates": 5000}``. None
+            values are left out, so that a command line's unset options change nothing.
+
+    Raises:
+        ConfigError: unknown preset, unreadable file, unknown key, or a value out of range.
+    """
+    source = "training settings"
+    data: dict[str, Any] = {}
+    if preset is not None:
+        path = _find(preset)
+        source = str(path)
+        try:
+            loaded = yaml.safe_load(path.read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"{path}: cannot be read ({error})") from None
+        except yaml.YAMLError as error:
+            raise ConfigError(f"{path}: not YAML ({' '.join(str(error).split())})") from None
+        if not isinstance(loaded, dict):
+            raise ConfigError(f"{path}: {type(loaded).__name__}, expected a mapping of settings")
+        data = loaded
+    for name, value in (overrides or {}).items():
+        if value is not None:
+            _put(data, name.split("."), value)
+    try:
+        return TypeAdapter(TrainConfig).validate_python(data)
+    except ValidationError as error:
+        raise ConfigError(f"{source}: {describe(error)}") from None
+    except ConfigError as error:
+        raise ConfigError(f"{source}: {error}") from None
+
+
+def _put(data: dict[str, Any], keys: list[str], value: Any) -> None:
+    inner = data.setdefault(keys[0], {}) if len(keys) > 1 else None
+    if isinstance(inner, dict):
+        _put(inner, keys[1:], value)
+    elif isinstance(value, Mapping) and isinstance(data.get(keys[0]), dict):
+        for name, item in value.items():
+            _put(data[keys[0]], [name], item)
+    else:
+        data[keys[0]] = value
+
+
+def _find(preset: str | Path) -> Path:
+    text = str(preset)
+    if text.endswith((".yaml", ".yml")) or "/" in text:
+        path = Path(text)
+        if not path.is_file():
+            raise ConfigError(f"{path}: no such training preset")
+        return path
+    folder = resource_path("config", "training")
+    path = folder / f"{text}.yaml"
+    if not path.is_file():
+        known = ", ".join(sorted(item.stem for item in folder.glob("*.yaml")))
+        raise ConfigError(f"training preset {text!r}: unknown, shipped are: {known}")
+    return path

@@ -1,0 +1,97 @@
+"""Which recordings a training run learns from: read, checked, sorted by who drove."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tractor_ems.bags.transitions import Trace, iter_traces
+from tractor_msgs_py.errors import BagError
+from tractor_msgs_py.trajectory import FloatArray
+from tractor_sim.powertrain import PowertrainParams
+from tractor_sim.powertrain_json import powertrain_hash
+
+EXPERT = ("dp", "")
+"""Provenance that counts as DP: its name, or none, where the user's word stands."""
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """Traces by who drove them.
+
+    Attributes:
+        dp: from ``bags``, driven by DP, by nobody that is known, or demand only.
+        rule: from ``rule_bags``, and those of ``bags`` whose provenance names another policy.
+    """
+
+    dp: tuple[Trace, ...]
+    rule: tuple[Trace, ...]
+
+    @property
+    def traces(self) -> tuple[Trace, ...]:
+        """All of them."""
+        return (*self.dp, *self.rule)
+
+    @property
+    def bag_hashes(self) -> list[str]:
+        """SHA-256 of every bag, sorted."""
+        return sorted({trace.bag_hash for trace in self.traces if trace.bag_hash})
+
+    @property
+    def cycle_hashes(self) -> list[str]:
+        """SHA-256 of every duty cycle that is known, sorted."""
+        return sorted({trace.cycle_hash for trace in self.traces if trace.cycle_hash})
+
+    @property
+    def cycles(self) -> list[str]:
+        """Names of the duty cycles, sorted."""
+        return sorted({trace.cycle for trace in self.traces if trace.cycle})
+
+
+def read_recordings(
+    bags: Sequence[Path],
+    rule_bags: Sequence[Path],
+    params: PowertrainParams,
+    *,
+    allow_other_powertrain: bool = False,
+) -> Recordings:
+    """Read and check every bag at or below the given paths.
+
+    Raises:
+        BagError: a bag cannot be read, steps by another time, or was recorded on another
+            powertrain (unless that is allowed).
+    """
+    given = iter_traces(bags) if bags else []
+    rule = iter_traces(rule_bags) if rule_bags else []
+    for trace in (*given, *rule):
+        check_trace(trace, params, allow_other_powertrain=allow_other_powertrain)
+    return Recordings(
+        dp=tuple(trace for trace in given if trace.policy in EXPERT),
+        rule=(*(trace for trace in given if trace.policy not in EXPERT), *rule),
+    )
+
+
+def check_trace(trace: Trace, params: PowertrainParams, *, allow_other_powertrain: bool) -> None:
+    """Refuse what cannot teach this powertrain.
+
+    Raises:
+        BagError: other step length, or other powertrain.
+    """
+    if abs(trace.dt_s - params.dt_s) > 1e-3 * params.dt_s:
+        raise BagError(
+            f"{trace.bag}: dt_s {trace.dt_s:g}, powertrain {params.name} steps by {params.dt_s:g}"
+        )
+    own = powertrain_hash(params)
+    if trace.powertrain_hash not in ("", own) and not allow_other_powertrain:
+        raise BagError(
+            f"{trace.bag}: recorded on powertrain {trace.powertrain or 'unknown'} "
+            f"({trace.powertrain_hash[:12]}), training is for {params.name} ({own[:12]})"
+        )
+
+
+def distinct_demands(traces: Sequence[Trace]) -> list[FloatArray]:
+    """Demand of every trace, each series once: a cycle driven by two experts is one experience of
+    the demand."""
+    series = {np.ascontiguousarray(t.power_demand_w).tobytes(): t.power_demand_w for t in traces}
+    return list(series.values())
