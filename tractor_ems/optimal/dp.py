@@ -11,7 +11,7 @@ import numpy as np
 
 from tractor_ems.optimal.kernel import backward
 from tractor_msgs_py.errors import ConfigError, CycleError
-from tractor_msgs_py.trajectory import FloatArray, IntArray
+from tractor_msgs_py.trajectory import FloatArray
 from tractor_sim import battery as _battery
 from tractor_sim.engine import fuel_rate_kg_per_s
 from tractor_sim.generator import to_bus_w, to_crank_w
@@ -27,18 +27,24 @@ SHORTFALL_MULTIPLE = 10.0
 target before it leaves work undone, and both are finite."""
 
 
+NODE_GAP = 1e-6
+"""Least width of a grid row and distance of its outermost nodes: well above the rounding of a
+float32 SOC, well below anything that matters."""
+
+
 @dataclass(frozen=True)
 class DpSolution:
     """Cost to go of one cycle.
 
     Attributes:
-        soc_grid: (N,), increasing; ``soc_target`` is a node.
-        values: (T + 1, N), V_k [kg]: fuel from step k on, plus priced shortfall and missing
-            energy at the end; finite everywhere.
+        soc_grid: (T + 1, N), nodes of every step, each row increasing; ``soc_target`` is a node
+            of the last row.
+        values: (T + 1, N), V_k at the nodes [kg]: fuel from step k on, plus priced shortfall and
+            missing energy at the end; finite everywhere.
         power_demand_w: (T,), the cycle it holds for, auxiliaries included [W].
         soc_target: where the run should end.
         soc_initial: where it starts; None: anywhere in the battery's window.
-        actions: size of the battery power grid.
+        soc_points, actions: sizes of the SOC and battery power grids.
         terminal_price_kg_per_j: price of the energy missing at the end; 0 above the target.
         shortfall_price_kg_per_j: price of unmet demand.
         powertrain_hash: the powertrain it holds for.
@@ -49,6 +55,7 @@ class DpSolution:
     power_demand_w: FloatArray
     soc_target: float
     soc_initial: float | None
+    soc_points: int
     actions: int
     terminal_price_kg_per_j: float
     shortfall_price_kg_per_j: float
@@ -71,10 +78,11 @@ def solve(
         power_demand_w: (T,), demand at the bus, auxiliaries included [W].
         soc_target: SOC to end at, within the battery's window. Ending above it costs nothing,
             ending below it costs more than any way to avoid it.
-        soc_points: nodes of the SOC grid, at least 3.
+        soc_points: nodes of the SOC grid at every step, at least 3.
         actions: battery powers over -P_b,max..P_b,max, at least 2. Besides these, lb, ub,
             every knot of the engine curve and landing exactly on the target are candidates.
-        soc_initial: spend all nodes on what a run from here to the target can pass through.
+        soc_initial: lay the nodes of each step over what a run from here to the target can pass
+            through then, bounds included. Finer, and exact where there is hardly any choice.
 
     Raises:
         ConfigError: the powertrain has engine memory, or a SOC or grid size is out of range.
@@ -82,33 +90,35 @@ def solve(
     """
     demand_w = np.ascontiguousarray(power_demand_w, dtype=np.float64)
     _check(params, demand_w, soc_target, soc_initial, soc_points, actions)
-    battery, dt_s = params.battery, params.dt_s
-    low, high = (battery.soc_min, battery.soc_max)
-    if soc_initial is not None:
-        low, high = _window(params, demand_w, soc_initial, soc_target)
-    soc_grid = _grid(low, high, soc_target, soc_points)
-    charge_w, discharge_w = _battery.power_limits_w(battery, soc_grid, dt_s)
-    power_w = _candidate_powers_w(params, soc_grid, soc_target, actions, charge_w, discharge_w)
+    power_w = battery_power_grid_w(params, actions)
     soc_move = _soc_moves(params, power_w)
-    top_cell, cell_start = _cells(soc_grid, soc_move)
-    knot_w = engine_knots_w(params)
+    if soc_initial is None:
+        row = _window_row(params, soc_target, soc_points)
+        soc_grid = np.tile(row, (len(demand_w) + 1, 1))
+    else:
+        low, high = reachable_soc(params, demand_w, soc_initial, soc_target)
+        soc_grid = _tube_rows(low, high, soc_points)
     price = terminal_price_kg_per_j(params)
-    values = np.empty((len(demand_w) + 1, len(soc_grid)))
-    values[-1] = price * battery.energy_j * np.maximum(soc_target - soc_grid, 0.0)
+    lb, ub, end_power_w, end_cost_kg = _node_candidates(
+        params, demand_w, soc_grid, SHORTFALL_MULTIPLE * price
+    )
+    knot_w = engine_knots_w(params)
+    values = np.empty_like(soc_grid)
+    missing_j = params.battery.energy_j * np.maximum(soc_target - soc_grid[-1], 0.0)
+    values[-1] = price * missing_j
     backward(
         values,
         soc_grid,
-        power_w,
-        soc_move[None, :],
-        top_cell,
-        cell_start,
-        engine_fuel_kg(params, demand_w[:, None] - power_w[None, :]),
         demand_w,
-        charge_w,
-        discharge_w,
+        power_w,
+        soc_move,
+        engine_fuel_kg(params, demand_w[:, None] - power_w[None, :]),
         knot_w,
         engine_fuel_kg(params, knot_w),
-        SHORTFALL_MULTIPLE * price * dt_s,
+        lb,
+        ub,
+        end_power_w,
+        end_cost_kg,
     )
     return DpSolution(
         soc_grid=soc_grid,
@@ -116,6 +126,7 @@ def solve(
         power_demand_w=demand_w,
         soc_target=soc_target,
         soc_initial=soc_initial,
+        soc_points=soc_points,
         actions=actions,
         terminal_price_kg_per_j=price,
         shortfall_price_kg_per_j=SHORTFALL_MULTIPLE * price,
@@ -123,16 +134,24 @@ def solve(
     )
 
 
+def cost_to_go_kg(solution: DpSolution, k: int, soc: FloatArray | float) -> FloatArray:
+    """V_k at any SOC (any shape): linear between nodes, the outermost slopes beyond them."""
+    grid, values = solution.soc_grid[k], solution.values[k]
+    below = (values[1] - values[0]) / (grid[1] - grid[0]) * np.minimum(soc - grid[0], 0.0)
+    above = (values[-1] - values[-2]) / (grid[-1] - grid[-2]) * np.maximum(soc - grid[-1], 0.0)
+    return np.interp(soc, grid, values) + below + above
+
+
 def co_state_kg_per_j(params: PowertrainParams, solution: DpSolution, k: int, soc: float) -> float:
     """What one more joule in the battery saves from step k on, -dV_k/dE [kg/J].
 
-    The secant over the nodes one step at full battery power away, or over the whole grid where
-    that is less: the slope of one cell alone carries the ripple of whole on and off steps.
+    The secant over one step at full battery power on either side, as far as the grid goes: the
+    slope of one cell alone carries the ripple of whole on and off steps.
     """
-    grid = solution.soc_grid
+    grid = solution.soc_grid[k]
     reach = params.battery.power_max_w * params.dt_s / params.battery.energy_j
     low, high = max(grid[0], soc - reach), min(grid[-1], soc + reach)
-    cost = np.interp([low, high], grid, solution.values[k])
+    cost = cost_to_go_kg(solution, k, np.array([low, high]))
     return float((cost[0] - cost[1]) / ((high - low) * params.battery.energy_j))
 
 
@@ -194,41 +213,44 @@ def _check(
         raise CycleError(f"power_demand_w: shape {demand_w.shape}, allowed (T,) and finite")
 
 
-def _window(
+def reachable_soc(
     params: PowertrainParams, demand_w: FloatArray, soc_initial: float, soc_target: float
-) -> tuple[float, float]:
-    """SOC range of all runs from soc_initial to soc_target, or to the nearest reachable SOC.
-
-    A little too wide: what one step can do is taken without the SOC limits, and two steps at
-    full battery power are added at either end, so that leaving the range is never mispriced.
-    """
+) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest SOC at every step, (T + 1,) each, of all runs between the two SOCs; the
+    end is the nearest SOC that can be reached where the target cannot."""
     battery = params.battery
-    engine_max_w = engine_knots_w(params)[-1]
+    lower, upper = battery.soc_min, battery.soc_max
     power_w = np.linspace(-battery.power_max_w, battery.power_max_w, 1025)
-    move = _soc_moves(params, power_w)
-    full = (-battery.power_max_w, battery.power_max_w)
-    rise = np.interp(np.clip(demand_w - engine_max_w, *full), power_w, move)
-    fall = np.interp(np.clip(demand_w, *full), power_w, move)
+    moves = _soc_moves(params, power_w)
+    rise = np.interp(demand_w - engine_knots_w(params)[-1], power_w, moves)
+    fall = np.interp(demand_w, power_w, moves)
     steps = len(demand_w)
-    lowest, highest = np.empty(steps + 1), np.empty(steps + 1)
-    lowest[0] = highest[0] = soc_initial
+    low, high = np.empty(steps + 1), np.empty(steps + 1)
+    low[0] = high[0] = soc_initial
     for k in range(steps):
-        lowest[k + 1] = min(max(lowest[k] + fall[k], battery.soc_min), battery.soc_max)
-        highest[k + 1] = min(max(highest[k] + rise[k], battery.soc_min), battery.soc_max)
-    end = min(max(soc_target, lowest[-1]), highest[-1])
-    to_end_rise = np.concatenate([np.cumsum(rise[::-1])[::-1], [0.0]])
-    to_end_fall = np.concatenate([np.cumsum(fall[::-1])[::-1], [0.0]])
-    lowest = np.maximum(lowest, np.minimum(end - to_end_rise, highest))
-    highest = np.minimum(highest, np.maximum(end - to_end_fall, lowest))
-    margin = 2.0 * float(move[0])
-    low = max(min(lowest.min(), soc_target) - margin, battery.soc_min)
-    high = min(max(highest.max(), soc_target) + margin, battery.soc_max)
-    return float(low), float(high)
+        low[k + 1] = min(max(low[k] + fall[k], lower), upper)
+        high[k + 1] = min(max(high[k] + rise[k], lower), upper)
+    from_low = from_high = min(max(soc_target, low[-1]), high[-1])
+    low[-1] = high[-1] = from_low
+    for k in range(steps - 1, -1, -1):
+        # At a limit the battery takes or gives less, so from there the limit itself is reached.
+        from_low = max(from_low - rise[k], lower) if from_low > lower else lower
+        from_high = min(from_high - fall[k], upper) if from_high < upper else upper
+        low[k], high[k] = max(low[k], from_low), min(high[k], from_high)
+    return low, np.maximum(low, high)
 
 
-def _grid(low: float, high: float, soc_target: float, soc_points: int) -> FloatArray:
-    """``soc_points`` nodes from low to high; evenly spaced on either side of soc_target, which
-    is one of them."""
+def _tube_rows(low: FloatArray, high: FloatArray, soc_points: int) -> FloatArray:
+    """Even nodes from low to high at every step, and one more just outside at either end: its
+    slope prices what cannot reach the target, or can only end above it."""
+    width = np.maximum(high - low, NODE_GAP)
+    inner = high[:, None] - width[:, None] * np.linspace(1.0, 0.0, soc_points)
+    return np.concatenate([inner[:, :1] - NODE_GAP, inner, inner[:, -1:] + NODE_GAP], axis=1)
+
+
+def _window_row(params: PowertrainParams, soc_target: float, soc_points: int) -> FloatArray:
+    """Nodes over the battery's window; evenly spaced on either side of soc_target, a node."""
+    low, high = params.battery.soc_min, params.battery.soc_max
     cells = soc_points - 1
     below = round(cells * (soc_target - low) / (high - low))
     below = min(max(below, int(soc_target > low)), cells - int(soc_target < high))
@@ -240,50 +262,48 @@ def _grid(low: float, high: float, soc_target: float, soc_points: int) -> FloatA
     )
 
 
-def _candidate_powers_w(
+def _node_candidates(
     params: PowertrainParams,
+    demand_w: FloatArray,
     soc_grid: FloatArray,
-    soc_target: float,
-    actions: int,
-    charge_w: FloatArray,
-    discharge_w: FloatArray,
+    shortfall_price_kg_per_j: float,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """lb and ub (T, N) of every node, and the candidates made for it with their cost (3, T, N):
+    lb, ub, and what lands on the highest SOC from which the target is still met.
+
+    Where lb > ub no choice is left, and both ends become what the plant then does: everything
+    for the load, with the shortfall priced, or braking into the battery.
+    """
+    battery = params.battery
+    demand = demand_w[:, None]
+    charge_w, discharge_w = _battery.power_limits_w(battery, soc_grid[:-1], params.dt_s)
+    engine_max_w = engine_knots_w(params)[-1]
+    lb = np.maximum(-charge_w, demand - engine_max_w)
+    ub = np.minimum(discharge_w, demand)
+    short_w = np.maximum(demand - engine_max_w - discharge_w, 0.0)
+    stuck = lb > ub
+    only = np.where(short_w > 0.0, discharge_w, -charge_w)
+    landing = landing_power_w(params, soc_grid[:-1], soc_grid[1:, -2:-1])
+    power = np.stack([np.where(stuck, only, lb), np.where(stuck, only, ub), landing])
+    cost = engine_fuel_kg(params, demand - power)
+    cost += shortfall_price_kg_per_j * params.dt_s * short_w
+    cost[2] = np.where((lb <= landing) & (landing <= ub), cost[2], np.inf)
+    return lb, ub, power, cost
+
+
+def landing_power_w(
+    params: PowertrainParams, soc: FloatArray, soc_after: FloatArray | float
 ) -> FloatArray:
-    """The action grid, every node's battery limits, and what lands a node on the target."""
-    grid_w = battery_power_grid_w(params, actions)
-    landing_w = landing_power_w(params, soc_grid, soc_target)
-    landing_w = landing_w[(landing_w > grid_w[0]) & (landing_w < grid_w[-1])]
-    return np.unique(np.concatenate([grid_w, -charge_w, discharge_w, landing_w]))
-
-
-def landing_power_w(params: PowertrainParams, soc: FloatArray, soc_target: float) -> FloatArray:
-    """Battery power that takes ``soc`` to the target in one step, limits aside [W]."""
-    return (soc - soc_target) * params.battery.energy_j / params.dt_s
+    """Battery power that takes ``soc`` to ``soc_after`` in one step, limits aside [W]."""
+    return (soc - soc_after) * params.battery.energy_j / params.dt_s
 
 
 def _soc_moves(params: PowertrainParams, power_w: FloatArray) -> FloatArray:
-    """SOC change of each power, shape (A,): a lossless battery moves alike from every node.
+    """SOC change of each power, shape (A,): a lossless battery moves alike from every SOC.
 
     Discharging is taken from the window's top and charging from its bottom, where neither meets
-    a limit before any other node would.
+    a limit before it would anywhere else.
     """
     battery = params.battery
     start = np.where(power_w > 0.0, battery.soc_max, battery.soc_min)
     return _battery.soc_after(battery, start, power_w, params.dt_s) - start
-
-
-def _cells(soc_grid: FloatArray, soc_move: FloatArray) -> tuple[IntArray, IntArray]:
-    """``top_cell`` (N,) and ``cell_start`` (N, C + 1) of the kernel."""
-    last_cell = len(soc_grid) - 2
-
-    def cell(soc: FloatArray) -> IntArray:
-        return np.clip(np.searchsorted(soc_grid, soc, side="right") - 1, 0, last_cell)
-
-    top = cell(soc_grid + soc_move[0])
-    bottom = cell(soc_grid + soc_move[-1])
-    cells = int((top - bottom).max()) + 1
-    wanted = top[:, None] - np.arange(cells + 1)[None, :]
-    threshold = soc_grid[np.clip(wanted + 1, 0, last_cell + 1)] - soc_grid[:, None]
-    start = len(soc_move) - np.searchsorted(soc_move[::-1], threshold)
-    start[:, 0] = 0
-    start[wanted < 0] = len(soc_move)
-    return top, start

@@ -1,119 +1,122 @@
 """The inner loop of the dynamic programme, compiled.
 
-Knows arrays only: next SOC and fuel of every candidate come in as tables, so another battery or
-engine is another table, not another kernel.
+Knows arrays only: SOC moves, limits and fuel come in as tables, so another battery or engine is
+another table, not another kernel.
 """
 
 import numpy as np
 from numba import njit
 
-from tractor_msgs_py.trajectory import FloatArray, IntArray
-
-# Not "reassoc": the result must not depend on how the compiler orders a sum.
-_FASTMATH = {"nnan", "nsz", "contract"}
+from tractor_msgs_py.trajectory import FloatArray
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FASTMATH)
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def backward(
     values: FloatArray,
     soc_grid: FloatArray,
+    power_demand_w: FloatArray,
     power_w: FloatArray,
     soc_move: FloatArray,
-    top_cell: IntArray,
-    cell_start: IntArray,
     fuel_kg: FloatArray,
-    power_demand_w: FloatArray,
-    charge_w: FloatArray,
-    discharge_w: FloatArray,
     knot_power_w: FloatArray,
     knot_fuel_kg: FloatArray,
-    shortfall_price_kg_per_w: float,
+    lb_w: FloatArray,
+    ub_w: FloatArray,
+    end_power_w: FloatArray,
+    end_cost_kg: FloatArray,
 ) -> None:
-    """Fill ``values[:-1]`` from ``values[-1]``: V_k(s) = min over u of fuel + V_{k+1}(s').
+    """Fill ``values[:-1]`` from ``values[-1]``: V_k(s) = min over u of cost + V_{k+1}(s').
 
-    V_{k+1} is piecewise linear over the grid and goes on with its outermost slopes beyond it.
-    Candidates of node i at step k: every table power within [lb, ub] and every engine knot.
+    V_{k+1} is piecewise linear over its row of nodes and goes on with the outermost slopes
+    beyond it. Candidates of node i at step k: every table power and every engine knot within
+    [lb, ub], and the M powers that were made for this node.
 
     Args:
         values: (T + 1, N), row T given [kg].
-        soc_grid: (N,), increasing.
-        power_w: (A,), battery powers, increasing; contains -charge_w and discharge_w of every
-            node, so that a lb or ub set by the battery is itself a candidate.
-        soc_move: (R, A), SOC change of each power, decreasing along a row; R is N, or 1 where
-            all nodes share it.
-        top_cell: (N,), the cell that power 0 of the table leads to.
-        cell_start: (N, C + 1), powers cell_start[i, c] up to cell_start[i, c + 1] lead from
-            node i to cell top_cell[i] - c.
-        fuel_kg: (T, A), fuel of the engine power that a table power leaves at step k.
+        soc_grid: (T + 1, N), every row increasing.
         power_demand_w: (T,).
-        charge_w, discharge_w: (N,), battery limits, magnitudes.
-        knot_power_w, knot_fuel_kg: (K,), engine powers at the bus from 0 (off) to the maximum,
-            increasing, and their fuel per step; so a lb or ub set by the engine is a candidate.
-        shortfall_price_kg_per_w: price of one watt of unmet demand over one step.
+        power_w: (A,), battery powers, increasing.
+        soc_move: (A,), SOC change of each power, decreasing.
+        fuel_kg: (T, A), fuel of the engine power that a table power leaves at step k.
+        knot_power_w, knot_fuel_kg: (K,), engine powers at the bus, increasing, and their fuel.
+        lb_w, ub_w: (T, N), feasible battery power; lb > ub rules table and knots out.
+        end_power_w, end_cost_kg: (M, T, N), powers made for each node and what they cost in this
+            step; inf rules one out. At least one per node is finite.
     """
-    steps, nodes = values.shape[0] - 1, soc_grid.shape[0]
-    knots, cells = knot_power_w.shape[0], cell_start.shape[1] - 1
-    engine_max_w, fuel_max_kg = knot_power_w[knots - 1], knot_fuel_kg[knots - 1]
-    first = np.searchsorted(power_w, -charge_w)
-    last = np.searchsorted(power_w, discharge_w, side="right")
+    steps, nodes = values.shape[0] - 1, values.shape[1]
     slopes = np.empty(nodes - 1)
-    left = np.empty(knots, dtype=np.int64)
-    weight = np.empty(knots)
     for k in range(steps - 1, -1, -1):
-        demand_w, fuel, following = power_demand_w[k], fuel_kg[k], values[k + 1]
+        following, grid, fuel = values[k + 1], soc_grid[k + 1], fuel_kg[k]
         for j in range(nodes - 1):
-            slopes[j] = (following[j + 1] - following[j]) / (soc_grid[j + 1] - soc_grid[j])
-        lowest = np.searchsorted(power_w, demand_w - engine_max_w)
-        highest = np.searchsorted(power_w, demand_w, side="right")
-        for q in range(knots):
-            wanted_w = demand_w - knot_power_w[q]
-            a = min(max(np.searchsorted(power_w, wanted_w) - 1, 0), power_w.shape[0] - 2)
-            left[q] = a
-            weight[q] = (wanted_w - power_w[a]) / (power_w[a + 1] - power_w[a])
+            slopes[j] = (following[j + 1] - following[j]) / (grid[j + 1] - grid[j])
+        top = 0
         for i in range(nodes):
-            soc = soc_grid[i]
-            move = soc_move[min(i, soc_move.shape[0] - 1)]
-            lb = max(-charge_w[i], demand_w - engine_max_w)
-            ub = min(discharge_w[i], demand_w)
-            if lb > ub:  # no choice is left: everything for the load, or braking into the battery
-                short_w = demand_w - engine_max_w - discharge_w[i]
-                a = last[i] - 1 if short_w > 0.0 else first[i]
-                after = soc + move[a]
-                j = _cell(soc_grid, after, top_cell[i])
-                best = following[j] + slopes[j] * (after - soc_grid[j])
-                if short_w > 0.0:
-                    best += fuel_max_kg + short_w * shortfall_price_kg_per_w
-                values[k, i] = best
-                continue
+            soc, lb, ub = soc_grid[k, i], lb_w[k, i], ub_w[k, i]
             best = np.inf
-            begin, end = max(first[i], lowest), min(last[i], highest)
-            for c in range(cells):
-                start, stop = max(begin, cell_start[i, c]), min(end, cell_start[i, c + 1])
-                if start < stop:
-                    j = top_cell[i] - c
-                    slope = slopes[j]
-                    least = np.inf
-                    for a in range(start, stop):
-                        least = min(least, fuel[a] + slope * move[a])
-                    best = min(best, least + following[j] + slope * (soc - soc_grid[j]))
-            j = top_cell[i]
-            for q in range(knots):
-                wanted_w = demand_w - knot_power_w[q]
+            a = np.searchsorted(power_w, lb)
+            last = np.searchsorted(power_w, ub, side="right")
+            if a < last:
+                top = _cell(grid, soc + soc_move[a], top)
+            j = top
+            while a < last:  # one cell at a time: within a cell only the table is read
+                stop = last
+                if j > 0 and soc + soc_move[last - 1] < grid[j]:
+                    stop = _first_below(soc_move, a, last, grid[j] - soc)
+                least, slope = np.inf, slopes[j]
+                for b in range(a, stop):
+                    cost = fuel[b] + slope * soc_move[b]
+                    if cost < least:
+                        least = cost
+                best = min(best, least + following[j] + slope * (soc - grid[j]))
+                a = stop
+                j -= 1
+            j = top
+            for q in range(len(knot_power_w)):
+                wanted_w = power_demand_w[k] - knot_power_w[q]
                 if lb <= wanted_w <= ub:
-                    a = left[q]
-                    after = soc + move[a] + weight[q] * (move[a + 1] - move[a])
-                    j = _cell(soc_grid, after, j)
-                    cost = following[j] + slopes[j] * (after - soc_grid[j]) + knot_fuel_kg[q]
+                    after = soc + _move(power_w, soc_move, wanted_w)
+                    j = _cell(grid, after, j)
+                    cost = knot_fuel_kg[q] + following[j] + slopes[j] * (after - grid[j])
                     best = min(best, cost)
+            for m in range(end_power_w.shape[0]):
+                cost = end_cost_kg[m, k, i]
+                if cost < np.inf:
+                    after = soc + _move(power_w, soc_move, end_power_w[m, k, i])
+                    j = _cell(grid, after, j)
+                    best = min(best, cost + following[j] + slopes[j] * (after - grid[j]))
             values[k, i] = best
 
 
 @njit(cache=True, error_model="numpy")
-def _cell(soc_grid: FloatArray, soc: float, start: int) -> int:
+def _cell(grid: FloatArray, soc: float, start: int) -> int:
     """The cell of ``soc``, walked to from a cell near it; the outermost ones have no far end."""
     j = start
-    while j > 0 and soc < soc_grid[j]:
+    while j > 0 and soc < grid[j]:
         j -= 1
-    while j < len(soc_grid) - 2 and soc >= soc_grid[j + 1]:
+    while j < len(grid) - 2 and soc >= grid[j + 1]:
         j += 1
     return j
+
+
+@njit(cache=True, error_model="numpy")
+def _first_below(soc_move: FloatArray, begin: int, end: int, threshold: float) -> int:
+    """First index from ``begin`` whose move is below the threshold, given that end - 1 is."""
+    step, low, high = 1, begin, begin
+    while high < end - 1 and soc_move[high] >= threshold:
+        low, high, step = high + 1, min(high + step, end - 1), 2 * step
+    while low < high:
+        middle = (low + high) // 2
+        if soc_move[middle] >= threshold:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@njit(cache=True, error_model="numpy")
+def _move(power_w: FloatArray, soc_move: FloatArray, wanted_w: float) -> float:
+    """SOC move of a power between two evenly spaced table powers."""
+    step_w = (power_w[-1] - power_w[0]) / (len(power_w) - 1)
+    x = (wanted_w - power_w[0]) / step_w
+    a = min(max(int(x), 0), len(power_w) - 2)
+    return soc_move[a] + (x - a) * (soc_move[a + 1] - soc_move[a])

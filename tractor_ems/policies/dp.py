@@ -9,12 +9,14 @@ import numpy as np
 
 from tractor_ems.optimal.dp import (
     DpSolution,
+    cost_to_go_kg,
     engine_fuel_kg,
     engine_knots_w,
     landing_power_w,
     solve,
 )
 from tractor_ems.policies.protocol import limits_of
+from tractor_msgs_py.codec import wire_soc
 from tractor_msgs_py.errors import PolicyError, RunAborted
 from tractor_msgs_py.observation import Observation, ObservationSpec
 from tractor_msgs_py.trajectory import FloatArray
@@ -31,10 +33,21 @@ from tractor_sim.powertrain_json import powertrain_hash
 
 
 @dataclass(frozen=True)
+class DpMemory:
+    """What the policy remembers: the stamp of tick 0 [ns], and the SOC it expects to see next,
+    shape (B,). None before the first tick."""
+
+    t0_ns: int | None
+    soc: FloatArray | None
+
+
+@dataclass(frozen=True)
 class DpPolicy:
     """Least fuel of this step plus V_{k+1} of where it leads, over the candidates of the DP.
 
-    Its state is the stamp of its first tick [ns], or None before that.
+    The SOC on the wire is a float32, 20 J coarse on "paper". The policy counts the SOC itself
+    and goes on with its own count for as long as that rounds to what it sees, so that a run
+    which has to be followed exactly is followed exactly.
 
     Attributes:
         params: the powertrain that ``solution`` was made for.
@@ -54,7 +67,7 @@ class DpPolicy:
         made_for, given = self.solution.powertrain_hash, powertrain_hash(self.params)
         if made_for != given:
             raise PolicyError(
-                f"dp solution of powertrain {made_for[:12]}, cannot drive {self.params.name} "
+                f"dp: solution of powertrain {made_for[:12]}, cannot drive {self.params.name} "
                 f"({given[:12]})"
             )
 
@@ -63,30 +76,52 @@ class DpPolicy:
         """No filters; the step length of the powertrain."""
         return ObservationSpec(dt_s=self.params.dt_s)
 
-    def init(self, batch: int) -> int | None:
-        """Stamp of tick 0, where it is known."""
-        return self.t0_ns
+    def init(self, batch: int) -> DpMemory:
+        """Nothing seen yet."""
+        initial = self.solution.soc_initial
+        return DpMemory(self.t0_ns, None if initial is None else np.full(batch, initial))
 
-    def act(self, observation: Observation, state: int | None) -> tuple[Command, int]:
+    def act(self, observation: Observation, state: DpMemory) -> tuple[Command, DpMemory]:
         """The command of every run of the batch.
 
         Raises:
-            RunAborted: the tick is not in the solved cycle, or its demand is not the solved one.
+            RunAborted: the tick is not in the solved cycle, its demand is not the solved one, or
+                the SOC is further from the solved range than one step reaches.
         """
-        t0_ns = observation.stamp_ns if state is None else state
-        k = self._tick(observation, t0_ns)
         params, solution = self.params, self.solution
-        soc, demand_w = observation.soc, observation.power_demand_w
-        lb, ub = feasible_battery_power_w(limits_of(observation), demand_w)
-        candidates_w = project(
-            candidate_powers_w(params, solution, demand_w, soc, lb, ub), lb[:, None], ub[:, None]
-        )
+        t0_ns = observation.stamp_ns if state.t0_ns is None else state.t0_ns
+        k = self._tick(observation, t0_ns)
+        soc = observation.soc
+        if state.soc is not None:
+            soc = np.where(wire_soc(state.soc) == soc, state.soc, soc)
+        self._check_soc(k, soc)
+        demand_w = observation.power_demand_w[:, None]
+        lb, ub = feasible_battery_power_w(limits_of(observation), observation.power_demand_w)
+        candidates_w = project(self._candidates_w(k, demand_w, soc), lb[:, None], ub[:, None])
         after = soc_after(params.battery, soc[:, None], candidates_w, params.dt_s)
-        cost_kg = engine_fuel_kg(params, demand_w[:, None] - candidates_w)
-        cost_kg = cost_kg + np.interp(after, solution.soc_grid, solution.values[k + 1])
+        cost_kg = engine_fuel_kg(params, demand_w - candidates_w)
+        cost_kg = cost_kg + cost_to_go_kg(solution, k + 1, after)
         chosen = np.argmin(cost_kg, axis=1)[:, None]
         battery_w = np.take_along_axis(candidates_w, chosen, axis=1)[:, 0]
-        return Command(battery_w, np.where(battery_w >= demand_w, 0.0, np.nan)), t0_ns
+        expected = np.take_along_axis(after, chosen, axis=1)[:, 0]
+        engine_off = battery_w >= observation.power_demand_w
+        command = Command(battery_w, np.where(engine_off, 0.0, np.nan))
+        return command, DpMemory(t0_ns, expected)
+
+    def _candidates_w(self, k: int, demand_w: FloatArray, soc: FloatArray) -> FloatArray:
+        """Shape (B, candidates), limits aside. Knots, off among them, and the landing come
+        before the grid, so that a tie goes to them; lb and ub come out of the projection."""
+        params, solution = self.params, self.solution
+        grid_w = battery_power_grid_w(params, solution.actions)
+        highest = solution.soc_grid[k + 1, -2]
+        return np.concatenate(
+            [
+                demand_w - engine_knots_w(params),
+                landing_power_w(params, soc, highest)[:, None],
+                np.broadcast_to(grid_w, (len(soc), len(grid_w))),
+            ],
+            axis=1,
+        )
 
     def _tick(self, observation: Observation, t0_ns: int) -> int:
         solved_w = self.solution.power_demand_w
@@ -104,6 +139,17 @@ class DpPolicy:
             )
         return k
 
+    def _check_soc(self, k: int, soc: FloatArray) -> None:
+        battery = self.params.battery
+        step = battery.power_max_w * self.params.dt_s / battery.energy_j
+        low, high = self.solution.soc_grid[k, [0, -1]]
+        outside = ~((soc >= low - step) & (soc <= high + step))
+        if np.any(outside):
+            raise RunAborted(
+                f"dp: tick {k}: SOC is {soc[np.argmax(outside)]}, solved for {low}..{high} "
+                f"(a run from {self.solution.soc_initial} to {self.solution.soc_target})"
+            )
+
 
 def solve_policy(
     params: PowertrainParams, cycle_demand_w: FloatArray, soc_initial: float, soc_target: float
@@ -112,31 +158,3 @@ def solve_policy(
     bus, auxiliaries included [W]. Raises what :func:`tractor_ems.optimal.dp.solve` raises."""
     solution = solve(params, cycle_demand_w, soc_target, soc_initial=soc_initial)
     return DpPolicy(params, solution)
-
-
-def candidate_powers_w(
-    params: PowertrainParams,
-    solution: DpSolution,
-    demand_w: FloatArray,
-    soc: FloatArray,
-    lb: FloatArray,
-    ub: FloatArray,
-) -> FloatArray:
-    """What the programme may choose from, shape (B, candidates), not yet limited to [lb, ub].
-
-    Off, the engine's knots and the exact landing come before the grid, so that a tie goes to
-    them.
-    """
-    knots_w = engine_knots_w(params)
-    grid_w = battery_power_grid_w(params, solution.actions)
-    batch = len(demand_w)
-    return np.concatenate(
-        [
-            ub[:, None],
-            lb[:, None],
-            demand_w[:, None] - knots_w[None, :],
-            landing_power_w(params, soc, solution.soc_target)[:, None],
-            np.broadcast_to(grid_w, (batch, len(grid_w))),
-        ],
-        axis=1,
-    )
