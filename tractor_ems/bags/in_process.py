@@ -123,7 +123,8 @@ def write_demand_bag(
 def write_samples_bag(
     out: Path, samples: Sequence[Sample], provenance: Mapping[str, str], namespace: str = ""
 ) -> None:
-    """Write samples in the given order, each logged at its stamp, run_info at that before it.
+    """Write samples in the given order, which readers keep: each is logged at its stamp, or with
+    the one before it where stamps go back, as they do at the start of a second run.
 
     Args:
         namespace: of the topics, for instance ``/tractor1``.
@@ -142,6 +143,6 @@ def write_samples_bag(
             name = f"{namespace}/{topic.name}"
             sequence[name] += 1
             if not isinstance(sample, RunInfo):
-                log_time_ns = sample.stamp_ns
+                log_time_ns = max(log_time_ns, sample.stamp_ns)
             data = serialize(message, topic.type)
             bag.write(name, data, log_time_ns, log_time_ns, sequence[name])

@@ -1,0 +1,168 @@
+"""Every check fails on the fault it is there for, and a verdict never passes by accident."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+
+from tractor_ems.bags.check import CHECKS, check, first_difference, shipped_powertrain
+from tractor_ems.bags.in_process import write_demand_bag
+from tractor_ems.bags.inspect import info
+from tractor_msgs_py.errors import BagError
+from tractor_msgs_py.types import (
+    BatteryPowerCommand,
+    BatteryReading,
+    PowerDemand,
+    PowertrainReading,
+    RunInfo,
+)
+
+
+def changed(samples, kind, k, **values):
+    """The samples with fields of the k-th sample of one kind replaced."""
+    index = [i for i, sample in enumerate(samples) if isinstance(sample, kind)][k]
+    out = list(samples)
+    out[index] = dataclasses.replace(out[index], **values)
+    return out
+
+
+def without(samples, kind, k):
+    out = list(samples)
+    del out[[i for i, sample in enumerate(samples) if isinstance(sample, kind)][k]]
+    return out
+
+
+def failed(report):
+    return {item.name for item in report.checks if item.outcome == "fail"}
+
+
+def test_good_bag_passes_every_check(bag):
+    report = check(bag)
+    assert report.verdict == "pass"
+    assert [item.name for item in report.checks] == list(CHECKS)
+    assert {item.outcome for item in report.checks} == {"pass"}
+    json.dumps(report.to_json(), allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "expected"),
+    [
+        (BatteryReading, {"soc": 0.95}, {"soc_limits", "parity"}),
+        (PowertrainReading, {"applied_battery_power_w": 260e3}, {"power_limits"}),
+        (PowertrainReading, {"applied_engine_power_w": -5.0}, {"power_limits"}),
+        (PowertrainReading, {"fuel_kg": 0.5}, {"parity"}),
+        (PowertrainReading, {"shortfall_j": 100.0}, {"energy_balance"}),
+        (PowertrainReading, {"dissipated_j": 100.0}, {"energy_balance"}),
+        (PowerDemand, {"power_w": 123e3}, {"energy_balance", "cycle", "parity"}),
+        (PowerDemand, {"power_w": math.nan}, {"values", "complete", "sequence"}),
+        (BatteryReading, {"soc": math.inf}, {"values", "complete", "sequence"}),
+        (PowertrainReading, {"fuel_kg": math.nan}, {"values", "complete", "sequence"}),
+        (BatteryPowerCommand, {"battery_power_w": math.nan}, {"values"}),
+        (BatteryPowerCommand, {"battery_power_w": 1e5}, {"parity"}),
+        (PowerDemand, {"stamp_ns": 0}, {"stamps", "sequence", "complete"}),
+    ],
+)
+def test_fault_in_one_sample_fails_its_check(driven, write, kind, values, expected):
+    report = check(write(changed(driven.samples, kind, 30, **values)))
+    assert report.verdict == "fail" and expected <= failed(report)
+
+
+@pytest.mark.parametrize(
+    "kind", [PowerDemand, BatteryReading, PowertrainReading, BatteryPowerCommand]
+)
+def test_missing_sample_fails_sequence_and_completeness(driven, write, kind):
+    report = check(write(without(driven.samples, kind, 30)))
+    assert {"sequence", "complete"} <= failed(report)
+
+
+def test_stamp_off_the_announced_grid_fails(driven, write):
+    stamp_ns = driven.info.stamp_ns(30) + 5
+    report = check(write(changed(driven.samples, PowerDemand, 30, stamp_ns=stamp_ns)))
+    assert "stamps" in failed(report)
+
+
+def test_aborted_run_fails_completeness_only(driven, write):
+    kept = [s for s in driven.samples if isinstance(s, RunInfo) or s.stamp_ns < 1_030 * 10**9]
+    assert failed(check(write(kept))) == {"complete"}
+
+
+def test_parity_is_judged_on_the_given_powertrain(driven, write):
+    other = dataclasses.replace(driven.info, powertrain="mine", powertrain_hash="0" * 64)
+    path = write([other, *driven.samples[1:]])
+    report = check(path)
+    assert report.verdict == "pass"
+    assert report.outcome("parity") == report.outcome("soc_limits") == "not_applicable"
+    assert "parity" in failed(check(path, driven.scenario.params))
+
+
+def test_demand_only_bag_passes_what_applies(tmp_path):
+    write_demand_bag(tmp_path / "bag", 10**9 * np.arange(5, 50), np.full(45, 9e4), "/t")
+    report = check(tmp_path / "bag")
+    assert report.verdict == "pass"
+    skipped = {item.name for item in report.checks if item.outcome == "not_applicable"}
+    assert skipped == {
+        "complete", "soc_limits", "power_limits", "energy_balance", "cycle", "parity"
+    }  # fmt: skip
+    (run,) = info(tmp_path / "bag")["runs"]
+    assert (run["run_id"], run["demand_samples"], run["driven_steps"]) == (None, 45, 0)
+
+
+def test_demand_only_bag_with_a_hole_or_jitter_fails(tmp_path):
+    stamps = 10**9 * np.arange(5, 50)
+    write_demand_bag(tmp_path / "hole", np.delete(stamps, 20), np.full(44, 9e4))
+    assert failed(check(tmp_path / "hole")) == {"sequence"}
+    late = stamps + np.where(np.arange(45) == 20, 20_000_000, 0)
+    write_demand_bag(tmp_path / "late", late, np.full(45, 9e4))
+    assert failed(check(tmp_path / "late")) == {"stamps"}
+
+
+def test_flipped_byte_is_no_pass(bag, tmp_path):
+    content = bytearray((bag / "bag_0.mcap").read_bytes())
+    content[len(content) // 3] ^= 0xFF
+    (tmp_path / "bag_0.mcap").write_bytes(content)
+    report = check(tmp_path / "bag_0.mcap")
+    assert report.verdict in ("fail", "no data")
+    assert report.outcome("parity") in ("pass", "not_run")
+
+
+def test_unreadable_bag_has_no_data_and_runs_no_check(tmp_path):
+    (tmp_path / "bag.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(100))
+    report = check(tmp_path / "bag.mcap")
+    assert report.verdict == "no data"
+    assert [item.outcome for item in report.checks] == ["fail"] + ["not_run"] * (len(CHECKS) - 1)
+
+
+def test_missing_bag_is_an_error(tmp_path):
+    with pytest.raises(BagError, match="no such bag"):
+        check(tmp_path / "nothing")
+
+
+def test_info_names_the_run_and_its_hash(bag, driven):
+    from tractor_msgs_py.trajectory import trajectory_hash
+
+    document = info(bag)
+    (run,) = document["runs"]
+    assert run["trajectory_hash"] == trajectory_hash(driven.trajectory)
+    assert run["fuel_kg"] == pytest.approx(driven.trajectory.fuel_kg.sum())
+    assert run["policy"] == "rule_based" and run["complete"] is True
+    assert {topic["name"] for topic in document["topics"]} == {
+        "/run_info", "/power_demand", "/battery_state", "/powertrain_state",
+        "/battery_power_command",
+    }  # fmt: skip
+
+
+def test_shipped_powertrain_is_found_by_its_hash(driven):
+    assert shipped_powertrain(driven.info.powertrain_hash) == driven.scenario.params
+    assert shipped_powertrain("0" * 64) is None
+
+
+def test_first_difference_names_column_and_step(driven):
+    other = driven.trajectory.fuel_kg.copy()
+    other[7] += 1.0
+    text = first_difference(
+        driven.trajectory, dataclasses.replace(driven.trajectory, fuel_kg=other)
+    )
+    assert text.startswith("fuel_kg differs from step 7")
+    assert first_difference(driven.trajectory, driven.trajectory) == "no difference"
