@@ -17,8 +17,8 @@ from typing import Any
 
 from tractor_ems.learning.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
 from tractor_ems.learning.config import TrainConfig, learning_rate
-from tractor_ems.learning.progress import Progress, Report, training_log
 from tractor_ems.learning.recordings import Recordings, read_recordings
+from tractor_ems.learning.training_log import Report, training_log
 from tractor_ems.policies.q_policy import save_policy
 from tractor_msgs_py import __version__
 from tractor_msgs_py.errors import ConfigError
@@ -158,10 +158,11 @@ def train_on(
                     metrics = {name: float(value) for name, value in latest.items()}
                     metrics["charts/SPS"] = (step - reported) / max(now - since, 1e-9)
                     metrics["charts/learning_rate"] = learning_rate(config.mode, step - 1)
+                    metrics["charts/seconds"] = now - began
                     reported, since = step, now
                     for report in (log, progress):
                         if report is not None:
-                            report(Progress(step, config.updates, metrics, now - began))
+                            report(step, metrics)
                 stopped = bool(interrupted) or (stop is not None and stop())
                 if step % config.checkpoint_every == 0 or stopped:
                     save_checkpoint(saved, learner.tensors(), run.state(), identity)
