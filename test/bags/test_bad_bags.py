@@ -73,7 +73,7 @@ def test_truncated_bag(bag, tmp_path, keep):
 def test_file_that_is_no_mcap(tmp_path, content):
     path = tmp_path / "thing.mcap"
     path.write_bytes(content)
-    with pytest.raises(BagError, match="thing.mcap"):
+    with pytest.raises(BagError, match=r"thing\.mcap"):
         read_bag(path)
 
 

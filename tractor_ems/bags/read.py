@@ -5,6 +5,7 @@ namespace. Judging a bag is ``check``'s job, and traces to learn from are made i
 """
 
 import hashlib
+import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -95,7 +96,16 @@ def provenance_of(path: Path) -> dict[str, str]:
         with file.open("rb") as stream:
             records = make_reader(stream).iter_metadata()
             return dict(next((r.metadata for r in records if r.name == PROVENANCE), {}))
-    except (OSError, yaml.YAMLError, McapError, KeyError, TypeError, AttributeError) as error:
+    except (
+        OSError,
+        yaml.YAMLError,
+        McapError,
+        struct.error,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+    ) as error:
         raise BagError(f"{path}: provenance cannot be read ({_brief(error)})") from None
 
 

@@ -1,10 +1,13 @@
 """An MCAP file below its samples: CRCs, channels, sequence numbers."""
 
+import os
 import struct
+import zlib
 from collections import defaultdict
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import IO
 
 import zstandard
 from mcap.exceptions import McapError
@@ -12,6 +15,20 @@ from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from tractor_msgs_py.errors import BagError
+
+MAGIC_BYTES = 8
+FOOTER_BYTES = 1 + 8 + 20
+"""Opcode, length, and start of summary, start of summary offsets, CRC."""
+
+_DAMAGE = (
+    OSError,
+    McapError,
+    zstandard.ZstdError,
+    struct.error,
+    ValueError,
+    MemoryError,  # a length field that says terabytes
+    OverflowError,
+)
 
 
 @dataclass(frozen=True)
@@ -50,18 +67,19 @@ class Scan:
 
 
 def scan_mcap(file: Path) -> Scan:
-    """Read a whole file and validate its CRCs.
+    """Read a whole file and validate the CRCs of chunks, data section and summary.
 
     Raises:
         BagError: a CRC is wrong, or the file is truncated or not MCAP.
     """
     chunks = without_crc = 0
-    data_crc = False
+    data_crc: bool | None = None
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     sequences: dict[int, list[int]] = defaultdict(list)
     try:
         with file.open("rb") as stream:
+            _validate_summary(stream)
             for record in StreamReader(stream, emit_chunks=True, validate_crcs=True).records:
                 inner: list[McapRecord] = [record]
                 if isinstance(record, Chunk):
@@ -78,9 +96,11 @@ def scan_mcap(file: Path) -> Scan:
                             channels[item.id] = item
                         case Message():
                             sequences[item.channel_id].append(item.sequence)
-    except (OSError, McapError, zstandard.ZstdError, struct.error, ValueError) as error:
+    except _DAMAGE as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise BagError(f"{file}: damaged ({reason})") from None
+    if data_crc is None:
+        raise BagError(f"{file}: damaged (no end of data)")
     return Scan(
         chunks,
         without_crc,
@@ -90,6 +110,17 @@ def scan_mcap(file: Path) -> Scan:
             for key, channel in sorted(channels.items())
         ),
     )
+
+
+def _validate_summary(stream: IO[bytes]) -> None:
+    """The one CRC that the MCAP library writes but does not read; leaves the stream at 0."""
+    stream.seek(-FOOTER_BYTES - MAGIC_BYTES, os.SEEK_END)
+    end = stream.tell() + FOOTER_BYTES - 4
+    _, _, start, _, expected = struct.unpack("<BQQQI", stream.read(FOOTER_BYTES))
+    stream.seek(start)
+    if expected and zlib.crc32(stream.read(end - start)) != expected:
+        raise BagError(f"{stream.name}: damaged (summary CRC)")
+    stream.seek(0)
 
 
 def _channel(channel: Channel, schema: Schema | None, sequences: list[int]) -> ScannedChannel:
