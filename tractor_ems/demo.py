@@ -1,7 +1,6 @@
 """The main job in one go: record experts through the real nodes, learn from the bags alone, drive
 the plant with what was learnt on cycles that training never saw."""
 
-import json
 import shutil
 import time
 from collections.abc import Callable
@@ -10,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from tractor_ems.evaluate import evaluate
+from tractor_ems.learning.config import load_train_config
+from tractor_ems.learning.train import train
 from tractor_ems.plots import plot_runs
 from tractor_ems.result import Result
 from tractor_ems.scenario import Scenario, make_scenario
@@ -66,7 +67,7 @@ def run_demo(out: Path, config: DemoConfig, say: Say) -> dict[str, Any]:
 
     bags = _record(out, config, tell)
     training = _train(out, config, bags, tell)
-    results, runs = _drive(config, training, tell)
+    results, runs = _drive(out, config, training, tell)
     for cycle, by_policy in runs.items():
         scenario = _scenario(config, cycle)
         title = f"held-out cycle {cycle}: learned offline from bags, driven in ROS 2 lockstep"
@@ -120,3 +121,48 @@ def _record(out: Path, config: DemoConfig, tell: Say) -> list[dict[str, Any]]:
             )
             tell(f"first picture: {picture}")
     return bags
+
+
+def _train(out: Path, config: DemoConfig, bags: list[dict[str, Any]], tell: Say) -> dict[str, Any]:
+    """Both target modes, from the bags alone."""
+    training = {}
+    experts, rules = (
+        [out / bag["path"] for bag in bags if bag["policy"] == name]
+        for name in ("dp", "rule_based")
+    )
+    for targets in ("counterfactual", "sampled"):
+        path = out / "policies" / f"ddqn_{targets}.safetensors"
+        settings = load_train_config(
+            targets, {"powertrain": config.powertrain, "seed": config.seed}
+        )
+        report = train(settings, experts, rules, path, command_line="ems demo")
+        training[targets] = {"policy": str(path.relative_to(out)), **report.to_json()}
+        tell(f"trained ddqn_{targets} offline, {settings.updates} updates")
+    return training
+
+
+def _drive(
+    out: Path, config: DemoConfig, training: dict[str, Any], tell: Say
+) -> tuple[list[Result], dict[str, dict[str, Trajectory]]]:
+    """Every policy over every held-out cycle: what was learnt through the nodes, the rest
+    in-process, where the trajectory is the same."""
+    results, runs = [], {}
+    for cycle in config.held_out_cycles:
+        scenario = _scenario(config, cycle)
+        runs[cycle] = {}
+        for targets, facts in training.items():
+            learnt = str(out / facts["policy"])
+            result, runs[cycle][f"ddqn_{targets}"] = evaluate(learnt, scenario, transport="ros")
+            results.append(result)
+        for policy in BASELINES:
+            result, trajectory = evaluate(policy, scenario)
+            results.append(result)
+            if policy in ("dp", "rule_based"):
+                runs[cycle][policy] = trajectory
+        tell(f"drove {cycle}: " + ", ".join(_scored(r) for r in results if r.cycle == cycle))
+    return results, runs
+
+
+def _scored(result: Result) -> str:
+    ratio = "-" if result.dp_ratio is None else f"{result.dp_ratio:.4f}"
+    return f"{result.policy} {ratio}"

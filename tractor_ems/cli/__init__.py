@@ -9,13 +9,16 @@ from collections.abc import Sequence
 
 from tractor_msgs_py.errors import TractorEmsError
 
+_LISTS = ("--bags", "--rule-bags")
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``ems`` and return its exit code."""
     from tractor_ems.cli.app import app
 
     try:
-        code = app(args=None if argv is None else list(argv), standalone_mode=False)
+        args = _spread(sys.argv[1:] if argv is None else argv)
+        code = app(args=args, standalone_mode=False)
         return code if isinstance(code, int) else 0
     except TractorEmsError as error:
         print(f"ems: {' '.join(str(error).split())}", file=sys.stderr)
@@ -30,3 +33,16 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         print(f"ems: {error.format_message()}", file=sys.stderr)
         return int(getattr(error, "exit_code", 2))
+
+
+def _spread(argv: Sequence[str]) -> list[str]:
+    """``--bags A B`` as ``--bags A --bags B``: typer's options take one value each."""
+    spread: list[str] = []
+    option = ""
+    for word in argv:
+        if word.startswith("-"):
+            option = word if word in _LISTS else ""
+        elif option and spread[-1] != option:
+            spread.append(option)
+        spread.append(word)
+    return spread

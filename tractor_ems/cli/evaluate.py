@@ -24,7 +24,7 @@ def evaluate(
     policy: Annotated[
         str,
         typer.Option(
-            help="conventional, rule_based, best_point, myopic_greedy, dp, default, or a policy file."
+            help="conventional, rule_based, best_point, myopic_greedy, dp, default, or a file."
         ),
     ] = "default",
     powertrain: Powertrain = "paper",
