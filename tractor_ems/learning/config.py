@@ -160,6 +160,7 @@ def load_train_config(
         preset: None: the defaults.
         overrides: nested like the file, or by dotted name: ``{"sampled.updates": 5000}``. None
             values are left out, so that a command line's unset options change nothing.
+            ``updates`` means those of the chosen mode.
 
     Raises:
         ConfigError: unknown preset, unreadable file, unknown key, or a value out of range.
@@ -179,8 +180,11 @@ def load_train_config(
             raise ConfigError(f"{path}: {type(loaded).__name__}, expected a mapping of settings")
         data = loaded
     for name, value in (overrides or {}).items():
-        if value is not None:
+        if value is not None and name != "updates":
             _put(data, name.split("."), value)
+    updates = (overrides or {}).get("updates")
+    if updates is not None:
+        _put(data, [str(data.get("targets", "counterfactual")), "updates"], updates)
     try:
         return TypeAdapter(TrainConfig).validate_python(data)
     except ValidationError as error:

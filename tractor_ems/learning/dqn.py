@@ -25,27 +25,29 @@ from tractor_ems.learning.networks import (
     to_numpy,
 )
 from tractor_ems.learning.replay import Replay, Transitions
-from tractor_ems.policies.mlp import Mlp
+from tractor_ems.policies.action_grid import in_range
+from tractor_ems.policies.mlp import Float32Array, Mlp
 
 
-def feasible_q(net: Net, inputs: Tensor, first: Tensor, last: Tensor) -> Tensor:
-    """Q of every action, shape (B, actions), -inf outside first..last."""
-    q = net(inputs)
-    action = torch.arange(q.shape[1])
-    infeasible = (action < first[:, None]) | (action > last[:, None])
-    return q.masked_fill_(infeasible, -torch.inf)
+def feasible_q(net: Net, inputs: Tensor, batch: Transitions) -> Float32Array:
+    """Q of every action in the next states, shape (B, actions), -inf where infeasible.
+
+    Mask and argmax in numpy: it is ten times faster at them than torch on one thread.
+    """
+    q: Float32Array = net(inputs).numpy()
+    np.copyto(q, -np.inf, where=~in_range(batch.next_first, batch.next_last, q.shape[1]))
+    return q
 
 
 @torch.no_grad()
 def td_target(online: Net, target: Net, batch: Transitions, *, double: bool) -> Tensor:
     """y of a batch, shape (B,)."""
     next_inputs = torch.from_numpy(batch.next_inputs)
-    first, last = torch.from_numpy(batch.next_first), torch.from_numpy(batch.next_last)
     if double:
-        chosen = feasible_q(online, next_inputs, first, last).argmax(dim=1)
-        next_q = target.at(next_inputs, chosen)
+        chosen = feasible_q(online, next_inputs, batch).argmax(axis=1)
+        next_q = target.at(next_inputs, torch.from_numpy(chosen))
     else:
-        next_q = feasible_q(target, next_inputs, first, last).amax(dim=1)
+        next_q = torch.from_numpy(feasible_q(target, next_inputs, batch).max(axis=1))
     return torch.from_numpy(batch.reward) + torch.from_numpy(batch.discount) * next_q
 
 

@@ -129,6 +129,6 @@ def replay_transitions(
         reward=(rewards[:-1] / reward.cost_unit).astype(np.float32),
         discount=np.full(count, gamma, dtype=np.float32),
         next_inputs=inputs[1:],
-        next_first=first[1:],
-        next_last=last[1:],
+        next_first=first[1:].astype(np.int16),
+        next_last=last[1:].astype(np.int16),
     )

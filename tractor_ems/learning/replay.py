@@ -15,8 +15,8 @@ _DTYPES: dict[str, Any] = {
     "action": np.int64,
     "reward": np.float32,
     "discount": np.float32,
-    "next_first": np.int64,
-    "next_last": np.int64,
+    "next_first": np.int16,
+    "next_last": np.int16,
 }
 
 
@@ -38,8 +38,8 @@ class Transitions:
     reward: NDArray[np.float32]
     discount: NDArray[np.float32]
     next_inputs: NDArray[np.float32]
-    next_first: NDArray[np.int64]
-    next_last: NDArray[np.int64]
+    next_first: NDArray[np.int16]
+    next_last: NDArray[np.int16]
 
     def __len__(self) -> int:
         return len(self.action)

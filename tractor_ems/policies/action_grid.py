@@ -5,6 +5,8 @@ ub, so the distinct actions are a contiguous range of indices whose ends are lb 
 themselves. "Engine off" (ub = P_dem) is the last of them, a state-dependent index.
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -51,7 +53,9 @@ def applied_index(
     return np.where((battery_power_w <= lb + EDGE_W) & engine_on, first, chosen)
 
 
-def in_range(first: IntArray, last: IntArray, actions: int) -> NDArray[np.bool_]:
-    """The range as a mask of shape (B, actions); for small batches."""
-    index = np.arange(actions)
+def in_range(
+    first: NDArray[np.integer[Any]], last: NDArray[np.integer[Any]], actions: int
+) -> BoolArray:
+    """The range as a mask of shape (B, actions); the narrower the integers, the faster."""
+    index = np.arange(actions, dtype=first.dtype)
     return (index >= first[:, None]) & (index <= last[:, None])

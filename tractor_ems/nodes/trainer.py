@@ -1,0 +1,138 @@
+"""``ems train`` as a node: learns from bags in a thread, tells its progress, exits when done.
+
+SIGINT and SIGTERM leave a checkpoint that ``resume`` continues. Learning itself is not in here.
+"""
+
+import json
+import shlex
+import sys
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, get_args
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
+from rclpy.node import Node
+from std_msgs.msg import String
+
+from tractor_ems.learning.config import load_train_config
+from tractor_ems.learning.rewards import RewardKind
+from tractor_ems.learning.train import TrainReport, train
+from tractor_msgs_py.errors import ConfigError
+from tractor_msgs_py.ros.shell import Parameter, qos_profile, run_node
+from tractor_msgs_py.topics import Qos
+
+PUBLISH_S = 0.5
+PROGRESS_QOS = Qos(durability="transient_local", depth=1)
+TARGETS = ("", "counterfactual", "sampled")
+
+PARAMETERS = (
+    Parameter("bags", [""], "bags or folders of bags to learn from, required"),
+    Parameter("rule_bags", [""], "rule-based bags for the seeding of sampled targets"),
+    Parameter("output", "", "policy file to write (.safetensors), required"),
+    Parameter("preset", "", "config/training name or YAML file; empty: that of the targets"),
+    Parameter("targets", "", "empty: the preset's, or else counterfactual", choices=TARGETS),
+    Parameter("reward", "", "empty: the preset's", choices=("", *get_args(RewardKind))),
+    Parameter("powertrain", "paper", "shipped name or YAML file of the powertrain"),
+    Parameter("updates", 0, "gradient steps, 0: the preset's", "", 0, 100_000_000),
+    Parameter("seed", -1, "seed of every generator, -1: the preset's", "", -1, 2**62),
+    Parameter("interact", -1, "simulated episodes to add, -1: the preset's", "", -1, 1_000_000),
+    Parameter(
+        "rule_share", -1.0, "replay share from rule-based bags, -1: the preset's", "", -1.0, 1.0
+    ),
+    Parameter("allow_other_powertrain", False, "learn from bags of another powertrain"),
+    Parameter("resume", False, "go on from the checkpoint beside the output"),
+)
+
+
+class Trainer:
+    """One training run in a thread that is always joined."""
+
+    def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
+        bags = [Path(name) for name in values["bags"] if name]
+        if not values["output"]:
+            raise ConfigError("parameter output: is empty, give the policy file to write")
+        if not bags and values["interact"] < 1:
+            raise ConfigError("parameter bags: is empty, give the bags to learn from")
+        config = load_train_config(
+            values["preset"] or values["targets"] or "counterfactual", _overrides(values)
+        )
+        self._publisher = node.create_publisher(String, "~/progress", qos_profile(PROGRESS_QOS))
+        self._clock = Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_timer(PUBLISH_S, self._publish, clock=self._clock)
+        self._updates = config.updates
+        self._latest: dict[str, Any] = {"state": "reading", "step": 0, "updates": config.updates}
+        self._stop = threading.Event()
+        self._report: TrainReport | None = None
+        self._error: BaseException | None = None
+
+        def work() -> None:
+            try:
+                self._report = train(
+                    config,
+                    bags,
+                    [Path(name) for name in values["rule_bags"] if name],
+                    Path(values["output"]),
+                    progress=self._note,
+                    stop=self._stop.is_set,
+                    resume=values["resume"],
+                    command_line=shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+                )
+            except BaseException as error:
+                self._error = error
+
+        self._logger = node.get_logger()
+        self._worker = threading.Thread(target=work, name="training")
+        self._worker.start()
+
+    def _note(self, step: int, metrics: dict[str, float]) -> None:
+        self._latest = {"state": "training", "step": step, "updates": self._updates, **metrics}
+
+    def _publish(self) -> None:
+        self._publisher.publish(String(data=json.dumps(self._latest, allow_nan=False)))
+
+    def finished(self) -> int | None:
+        """0 when the policy is written; raises what ended the training otherwise."""
+        if self._worker.is_alive():
+            return None
+        self._worker.join()
+        if self._error is not None:
+            raise self._error
+        return 0
+
+    def shutdown(self) -> None:
+        """Stop after the present update, which leaves a checkpoint; say how it ended."""
+        self._stop.set()
+        self._worker.join()
+        if self._report is not None:
+            state = "done" if self._report.policy else "stopped"
+            self._latest = {**self._latest, "state": state, "step": self._report.updates}
+            self._publish()
+            self._publisher.wait_for_all_acked(Duration(seconds=1.0))
+            written = self._report.policy or self._report.checkpoint
+            self._logger.info(f"{state} after {self._report.updates} updates: {written}")
+
+
+def _overrides(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Parameters that were set, as configuration; the rest is the preset's."""
+    return {
+        "targets": values["targets"] or None,
+        "reward.kind": values["reward"] or None,
+        "powertrain": values["powertrain"],
+        "updates": values["updates"] or None,
+        "seed": None if values["seed"] < 0 else values["seed"],
+        "interact": None if values["interact"] < 0 else values["interact"],
+        "sampled.rule_share": None if values["rule_share"] < 0 else values["rule_share"],
+        "allow_other_powertrain": values["allow_other_powertrain"] or None,
+    }
+
+
+def main() -> int:
+    """Entry point."""
+    return run_node("trainer", PARAMETERS, Trainer)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
