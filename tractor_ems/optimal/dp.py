@@ -139,7 +139,8 @@ def cost_to_go_kg(solution: DpSolution, k: int, soc: FloatArray | float) -> Floa
     grid, values = solution.soc_grid[k], solution.values[k]
     below = (values[1] - values[0]) / (grid[1] - grid[0]) * np.minimum(soc - grid[0], 0.0)
     above = (values[-1] - values[-2]) / (grid[-1] - grid[-2]) * np.maximum(soc - grid[-1], 0.0)
-    return np.interp(soc, grid, values) + below + above
+    cost: FloatArray = np.interp(soc, grid, values) + below + above
+    return cost
 
 
 def co_state_kg_per_j(params: PowertrainParams, solution: DpSolution, k: int, soc: float) -> float:

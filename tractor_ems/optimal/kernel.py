@@ -119,4 +119,5 @@ def _move(power_w: FloatArray, soc_move: FloatArray, wanted_w: float) -> float:
     step_w = (power_w[-1] - power_w[0]) / (len(power_w) - 1)
     x = (wanted_w - power_w[0]) / step_w
     a = min(max(int(x), 0), len(power_w) - 2)
-    return soc_move[a] + (x - a) * (soc_move[a + 1] - soc_move[a])
+    move: float = soc_move[a] + (x - a) * (soc_move[a + 1] - soc_move[a])
+    return move

@@ -4,6 +4,7 @@ A reference, not a controller: it knows the whole cycle beforehand and refuses a
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -111,17 +112,18 @@ class DpPolicy:
     def _candidates_w(self, k: int, demand_w: FloatArray, soc: FloatArray) -> FloatArray:
         """Shape (B, candidates), limits aside. Knots, off among them, and the landing come
         before the grid, so that a tie goes to them; lb and ub come out of the projection."""
-        params, solution = self.params, self.solution
-        grid_w = battery_power_grid_w(params, solution.actions)
-        highest = solution.soc_grid[k + 1, -2]
-        return np.concatenate(
-            [
-                demand_w - engine_knots_w(params),
-                landing_power_w(params, soc, highest)[:, None],
-                np.broadcast_to(grid_w, (len(soc), len(grid_w))),
-            ],
-            axis=1,
-        )
+        grid_w = self._grid_w
+        landing_w = landing_power_w(self.params, soc, self.solution.soc_grid[k + 1, -2])
+        every_w = np.broadcast_to(grid_w, (len(soc), len(grid_w)))
+        return np.concatenate([demand_w - self._knots_w, landing_w[:, None], every_w], axis=1)
+
+    @cached_property
+    def _knots_w(self) -> FloatArray:
+        return engine_knots_w(self.params)
+
+    @cached_property
+    def _grid_w(self) -> FloatArray:
+        return battery_power_grid_w(self.params, self.solution.actions)
 
     def _tick(self, observation: Observation, t0_ns: int) -> int:
         solved_w = self.solution.power_demand_w

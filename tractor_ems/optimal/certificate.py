@@ -1,0 +1,149 @@
+"""Proof by refinement that a grid is fine enough: halve every grid step until the fuel stands."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from tractor_ems.optimal.dp import (
+    DpSolution,
+    co_state_kg_per_j,
+    cost_to_go_kg,
+    reachable_soc,
+    solve,
+)
+from tractor_ems.optimal.rollout import roll_out
+from tractor_msgs_py.errors import ConfigError
+from tractor_msgs_py.trajectory import FloatArray
+from tractor_sim.powertrain import PowertrainParams
+
+HALVING_LIMIT = 5e-4
+"""Largest relative change of the optimal value when every grid step is halved."""
+
+ROLLOUT_LIMIT = 1e-3
+"""Largest relative distance of the roll-out on the real plant from the value."""
+
+RESIDUAL_LIMIT = 2e-4
+"""Largest priced energy missing at the end of the roll-out, relative to its fuel."""
+
+NEGLIGIBLE_KG = 1e-4
+"""Fuel below which the three limits are absolute, in parts of this mass: a tenth of a gram."""
+
+SOC_TOLERANCE = 1e-6
+"""Slack for SOC that came over the wire as a float32."""
+
+MAX_SOC_POINTS = 3300
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """How good the finer of two grids is.
+
+    Attributes:
+        grid_halving_change: |V - V of the grid with steps twice as large| / V, V the optimal
+            value at the start.
+        rollout_gap: (roll-out - V) / V, the roll-out with its residual priced.
+        residual: priced energy missing at the end of the roll-out, relative to its fuel.
+        soc_points, actions: the finer grid.
+        fuel_kg: fuel of the roll-out on the real plant, its residual priced at the co-state.
+        soc_initial, soc_final: where the roll-out starts and really ends.
+        ok: all three within their limits.
+    """
+
+    grid_halving_change: float
+    rollout_gap: float
+    residual: float
+    soc_points: int
+    actions: int
+    fuel_kg: float
+    soc_initial: float
+    soc_final: float
+    ok: bool
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data."""
+        return asdict(self)
+
+
+def certify(
+    params: PowertrainParams,
+    power_demand_w: FloatArray,
+    soc_initial: float,
+    soc_final: float,
+    *,
+    soc_points: int = 401,
+    actions: int = 1600,
+) -> Certificate:
+    """Solve and roll out on ever finer grids until the result stands.
+
+    Args:
+        power_demand_w: (T,), demand at the bus, auxiliaries included [W].
+        soc_initial, soc_final: both within the battery's window; float32 rounding is forgiven.
+        soc_points, actions: the coarsest grid; refined to at most :data:`MAX_SOC_POINTS` nodes.
+
+    Raises:
+        ConfigError: a SOC is outside the window, or soc_final cannot be reached on this cycle.
+    """
+    start, end = _checked_soc(params, power_demand_w, soc_initial, soc_final)
+    coarse = solve(
+        params, power_demand_w, end, soc_initial=start, soc_points=soc_points, actions=actions
+    )
+    while True:
+        fine = solve(
+            params,
+            power_demand_w,
+            end,
+            soc_initial=start,
+            soc_points=2 * coarse.soc_points - 1,
+            actions=2 * coarse.actions - 1,
+        )
+        certificate = _compare(params, coarse, fine, start)
+        if certificate.ok or 2 * fine.soc_points - 1 > MAX_SOC_POINTS:
+            return certificate
+        coarse = fine
+
+
+def _compare(
+    params: PowertrainParams, coarse: DpSolution, fine: DpSolution, soc_initial: float
+) -> Certificate:
+    run = roll_out(fine, params)
+    missing_j = max(fine.soc_target - run.soc_final, 0.0) * params.battery.energy_j
+    residual_kg = missing_j * co_state_kg_per_j(params, fine, 0, soc_initial)
+    fuel_kg = float(run.fuel_kg.sum()) + residual_kg
+    shortfall_kg = fine.shortfall_price_kg_per_j * float(run.shortfall_j.sum())
+    value_kg = float(cost_to_go_kg(fine, 0, soc_initial))
+    scale_kg = max(value_kg, NEGLIGIBLE_KG)
+    change = abs(value_kg - float(cost_to_go_kg(coarse, 0, soc_initial))) / scale_kg
+    gap = (fuel_kg + shortfall_kg - value_kg) / scale_kg
+    residual = residual_kg / max(fuel_kg, NEGLIGIBLE_KG)
+    return Certificate(
+        grid_halving_change=change,
+        rollout_gap=gap,
+        residual=residual,
+        soc_points=fine.soc_points,
+        actions=fine.actions,
+        fuel_kg=fuel_kg,
+        soc_initial=soc_initial,
+        soc_final=run.soc_final,
+        ok=change < HALVING_LIMIT and abs(gap) < ROLLOUT_LIMIT and residual < RESIDUAL_LIMIT,
+    )
+
+
+def _checked_soc(
+    params: PowertrainParams, power_demand_w: FloatArray, soc_initial: float, soc_final: float
+) -> tuple[float, float]:
+    battery = params.battery
+    clipped = np.clip([soc_initial, soc_final], battery.soc_min, battery.soc_max)
+    for name, given, inside in zip(
+        ("soc_initial", "soc_final"), (soc_initial, soc_final), clipped, strict=True
+    ):
+        if not abs(given - inside) <= SOC_TOLERANCE:
+            raise ConfigError(f"{name}: {given}, allowed {battery.soc_min}..{battery.soc_max}")
+    start, end = float(clipped[0]), float(clipped[1])
+    nearest = float(reachable_soc(params, power_demand_w, start, end)[1][-1])
+    if abs(end - nearest) > SOC_TOLERANCE:
+        raise ConfigError(
+            f"soc_final: {soc_final} cannot be reached from {soc_initial} on this cycle, "
+            f"the nearest is {nearest}"
+        )
+    return start, nearest
