@@ -13,7 +13,7 @@ endif
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test test-slow lint format clean
+.PHONY: help venv demo test test-slow lint format shipped-policy golden-bags clean
 
 help:
 	@echo 'make demo       record experts, learn from their bags, drive the plant: out/demo'
@@ -21,6 +21,8 @@ help:
 	@echo 'make test-slow  the slow ones'
 	@echo 'make lint       ruff and mypy'
 	@echo 'make format     let ruff format the code'
+	@echo 'make shipped-policy  train the policy that ships, tractor_sim/data/policy'
+	@echo 'make golden-bags     record bags/ anew through the nodes'
 	@echo 'make venv       build .venv only (EXTRAS=$(EXTRAS))'
 	@echo 'make clean      remove .venv, builds, caches and out/demo'
 
@@ -53,6 +55,16 @@ lint: $(STAMP)
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+# DP and rule-based runs on twelve training cycles, then training from those bags alone.
+SHIPPED := tractor_sim/data/policy
+shipped-policy: $(STAMP)
+	rm -rf out/shipped
+	for seed in 1 2 3 4 5 6 8 9 10 11 12 13; do for policy in dp rule_based; do \
+	  $(BIN)/ems evaluate --policy $$policy --cycle planter_$$seed --soc-target 0.836 \
+	    --record out/shipped/$${policy}_planter_$$seed >/dev/null || exit; done; done
+	$(BIN)/ems train --bags out/shipped --out out/shipped/paper.safetensors
+	mkdir -p $(SHIPPED) && cp out/shipped/paper.safetensors $(SHIPPED)/
 
 clean:
 	rm -rf $(VENV) build dist install log out/demo *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
