@@ -76,7 +76,7 @@ class SampledConfig:
         epsilon_start, epsilon_end: exploration of simulated episodes, linear over them.
     """
 
-    updates: Count = 20_000
+    updates: Count = 6000
     batch: Count = 64
     learning_rate: Rate = 1e-3
     hold_fraction: Fraction = 0.5
