@@ -6,7 +6,7 @@ commands to publish come out. It neither subscribes nor publishes.
 
 from collections import Counter
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 from tractor_ems.policies.protocol import Policy
 from tractor_ems.safety import fallback_command, safe_command
@@ -21,15 +21,12 @@ from tractor_msgs_py.types import (
     RunInfo,
 )
 
+Observed: TypeAlias = PowerDemand | BatteryReading | PowertrainReading
+"""A sample of what a policy observes."""
 
-class RunGuard(Protocol):
-    """What a policy that was made for certain runs only checks; it raises to end the node."""
 
-    def check_run(self, run: RunInfo) -> None:
-        """Raise a TractorEmsError where the policy must not drive ``run``."""
-
-    def check_observation(self, run: RunInfo, observation: Observation) -> None:
-        """Raise RunAborted where the run is not what was promised."""
+RunCheck: TypeAlias = Callable[[RunInfo], None]
+"""Raises a TractorEmsError where a policy must not drive a run."""
 
 
 class Answerer:
@@ -47,14 +44,14 @@ class Answerer:
         policy: Policy,
         powertrain_hash: str | None = None,
         observation_timeout_s: float = 2.0,
-        guard: RunGuard | None = None,
+        check_run: RunCheck | None = None,
     ) -> None:
         self.policy = policy
         self.corrected = 0
         self.fallbacks = 0
         self._powertrain_hash = powertrain_hash
         self._timeout_s = observation_timeout_s
-        self._guard = guard
+        self._check_run = check_run
         self._builder = ObservationBuilder(policy.spec)
         self._memory: Any = None
         self._forget()
@@ -77,6 +74,12 @@ class Answerer:
         return self._builder.refusals
 
     @property
+    def counters(self) -> dict[str, int]:
+        """What people want to see."""
+        refused = {f"refused_{reason}": count for reason, count in sorted(self.refusals.items())}
+        return {"corrected": self.corrected, "fallbacks": self.fallbacks, **refused}
+
+    @property
     def active(self) -> bool:
         """True while a run that this policy has answered is not over."""
         return self._answer is not None and not self._over
@@ -86,6 +89,7 @@ class Answerer:
 
         Raises:
             PolicyError: the policy was made for another powertrain or another step length.
+            TractorEmsError: whatever ``check_run`` found.
         """
         if self.run is not None and run.run_id == self.run.run_id:
             return
@@ -95,15 +99,15 @@ class Answerer:
                 f"the run has {run.powertrain} {run.powertrain_hash[:16]}; "
                 "allow_other_powertrain would let it"
             )
-        if self._guard is not None:
-            self._guard.check_run(run)
+        if self._check_run is not None:
+            self._check_run(run)
         self._builder.start_run(run)
         self._memory = self.policy.init(1)
         self._forget()
 
     def observe(
         self,
-        sample: PowerDemand | BatteryReading | PowertrainReading,
+        sample: Observed,
         command_subscribers: Callable[[], int],
         now_s: float,
     ) -> BatteryPowerCommand | None:
@@ -112,8 +116,7 @@ class Answerer:
         Before the first command of a run the plant and every recorder must be connected to the
         command topic: until then the answer stays in the cache and the plant repeats its tick.
 
-        Raises:
-            RunAborted: the run's guard found that it is not the promised one.
+        Raises whatever the policy raises, RunAborted where the run is not the promised one.
         """
         run = self.run
         if run is not None and sample.stamp_ns >= run.stamp_ns(run.steps):
@@ -124,9 +127,7 @@ class Answerer:
         observation = self._builder.add(sample)
         if observation is None or run is None:
             return None
-        if self._guard is not None:
-            self._guard.check_observation(run, observation)
-        self._observation, self._heard_s = observation, now_s
+        self._observation, self._heard_s, self._over = observation, now_s, False
         command, self._memory = self.policy.act(observation, self._memory)
         self._answer, corrected = safe_command(observation, command)
         self.corrected += corrected

@@ -37,7 +37,7 @@ def evaluate(
 
         trajectory = run_ros(
             _policy_arguments(policy, scenario, allow_other_powertrain), scenario, record=record
-        )
+        ).trajectory
     elif record is not None:
         from tractor_ems.bags.in_process import record_in_process
 

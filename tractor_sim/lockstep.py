@@ -109,28 +109,31 @@ class Lockstep:
     @property
     def counters(self) -> dict[str, int]:
         """What people want to see: resends and refusals by reason."""
-        return {"resends": self.resends, **_named(self.refusals)}
+        return {"resends": self.resends, **named(self.refusals)}
 
-    def poll(self, peers: Peers, now_s: float) -> tuple[Sample, ...]:
-        """Samples to publish now: the first tick, or the present one again.
+    def start(self, peers: Peers, now_s: float) -> tuple[Sample, ...]:
+        """The first tick once everyone is connected, nothing before.
 
         Raises:
-            RunAborted: no answer within the timeout, two policies, or no start.
+            RunAborted: nobody came within the timeout, or more than one policy did.
         """
-        if self.done:
+        if not self._gate.open(peers, now_s):
             return ()
-        if not self.started:
-            if not self._gate.open(peers, now_s):
-                return ()
-            self.started = True
-            return self._send(now_s)
-        refuse_second_policy(peers.command_publishers)
-        waited_s = now_s - self._tick_since_s
-        if waited_s > self._answer_timeout_s:
+        self.started = True
+        return self._send(now_s)
+
+    def poll(self, command_publishers: int, now_s: float) -> tuple[Sample, ...]:
+        """The present tick again when it has waited for long enough, else nothing.
+
+        Raises:
+            RunAborted: no answer within the timeout, or more than one policy is connected.
+        """
+        refuse_second_policy(command_publishers)
+        if now_s - self._tick_since_s > self._answer_timeout_s:
             raise RunAborted(
                 f"no answer to tick {self.run.k} (stamp {self.run.stamp_ns} ns) within "
                 f"{self._answer_timeout_s:g} s: the policy died or hangs, "
-                f"{peers.command_publishers} publishers on {topics.COMMAND.name}"
+                f"{command_publishers} publishers on {topics.COMMAND.name}"
             )
         if now_s - self._sent_s < RESEND_S:
             return ()
@@ -168,15 +171,16 @@ class Lockstep:
         return self.run.samples()
 
     def _refusal(self, command: BatteryPowerCommand) -> str | None:
-        if not self.started or self.done:
+        if not self.started:
             return "no_tick_in_flight"
         if command.mode is not CommandMode.NOMINAL:
             return f"{command.mode.name.lower()}_mode"
-        if command.stamp_ns == self.run.stamp_ns:
+        if command.stamp_ns == self.run.stamp_ns and not self.done:
             return None
         ticks, rest = divmod(command.stamp_ns - self.run.info.t0_ns, self.run.info.dt_ns)
         return "repeated_answer" if not rest and 0 <= ticks < self.run.k else "other_stamp"
 
 
-def _named(refusals: Counter[str]) -> dict[str, int]:
+def named(refusals: Counter[str]) -> dict[str, int]:
+    """Refusals by reason, as counters for people."""
     return {f"refused_{reason}": count for reason, count in sorted(refusals.items())}

@@ -5,7 +5,6 @@ node only carries samples. The physics is ``powertrain.step``, as everywhere els
 """
 
 import uuid
-from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -80,6 +79,12 @@ class PlantRun:
             return state
         return (PowerDemand(self.stamp_ns, float(self.power_demand_w[self.k])), *state)
 
+    def closing_samples(self) -> tuple[Sample, ...]:
+        """The end of a finished run as it is repeated until everyone has acknowledged it."""
+        last = self.info.steps - 1
+        demand = PowerDemand(self.info.stamp_ns(last), float(self.power_demand_w[last]))
+        return (demand, *self.samples())
+
     def feasible_w(self) -> tuple[float, float]:
         """lb and ub of battery power at the present tick [W]."""
         demand_w = self.power_demand_w[self.k : self.k + 1]
@@ -139,7 +144,7 @@ def prepare_run(
     soc_target: float = UNSET_SOC,
     mode: Literal["lockstep", "real_time"] = "lockstep",
     expected_recorders: int = 0,
-    command_line: Sequence[str] = (),
+    command_line: str = "",
 ) -> PlantRun:
     """A run from names or files, with a run id of its own.
 
@@ -187,6 +192,6 @@ def prepare_run(
         lockstep=mode == "lockstep",
         expected_recorders=expected_recorders,
         package_version=__version__,
-        command_line=" ".join(command_line),
+        command_line=command_line,
     )
     return PlantRun(params, info, duty.power_demand_w + params.p_aux_w)

@@ -8,7 +8,7 @@ import math
 from collections import Counter
 
 from tractor_msgs_py.types import BatteryPowerCommand, CommandMode, Sample
-from tractor_sim.lockstep import Peers, StartGate
+from tractor_sim.lockstep import Peers, StartGate, named
 from tractor_sim.plant_run import PlantRun
 
 
@@ -60,27 +60,29 @@ class RealTime:
     @property
     def counters(self) -> dict[str, int]:
         """What people want to see: fallback steps and refusals by reason."""
-        named = {f"refused_{reason}": count for reason, count in sorted(self.refusals.items())}
-        return {"fallback_ticks": self.fallback_ticks, **named}
+        return {"fallback_ticks": self.fallback_ticks, **named(self.refusals)}
 
-    def poll(self, peers: Peers, now_s: float) -> tuple[Sample, ...]:
+    def start(self, peers: Peers, now_s: float) -> tuple[Sample, ...]:
+        """The first tick once everyone is connected, nothing before.
+
+        Raises:
+            RunAborted: nobody came within the timeout, or more than one policy did.
+        """
+        if not self._gate.open(peers, now_s):
+            return ()
+        self.started = True
+        self._due_s = now_s
+        return self._publish(now_s)
+
+    def poll(self, command_publishers: int, now_s: float) -> tuple[Sample, ...]:
         """Samples of the next tick when the present step's time is over, else nothing.
 
         A plant that was held up does not rush to catch up: time starts again from now.
-
-        Raises:
-            RunAborted: no policy came within the match timeout, or two did.
         """
-        if self.done:
-            return ()
-        if not self.started:
-            if not self._gate.open(peers, now_s):
-                return ()
-            self.started = True
-            self._due_s = now_s
-            return self._publish(now_s)
         if now_s < self._due_s:
             return ()
+        if command_publishers > 1:
+            self._newest = None
         self.run.apply(self._command(now_s))
         return self._publish(now_s)
 

@@ -30,6 +30,7 @@ def summary(run: PlantRun, counters: dict[str, int]) -> dict[str, Any]:
     fuel_kg = float(trajectory.fuel_kg.sum())
     crank_w = to_crank_w(run.params.generator, trajectory.engine_power_w, engine.power_max_w)
     work_j = float(crank_w.sum()) * run.params.dt_s
+    before = np.concatenate(([False], trajectory.engine_on[:-1]))
     return {
         "run_id": run.info.run_id,
         "cycle": run.info.cycle,
@@ -44,9 +45,7 @@ def summary(run: PlantRun, counters: dict[str, int]) -> dict[str, Any]:
         "soc_initial": run.info.soc_initial,
         "soc_final": trajectory.soc_final,
         "soc_target": run.info.soc_target,
-        "engine_starts": int(
-            np.sum(np.diff(trajectory.engine_on, prepend=False) & trajectory.engine_on)
-        ),
+        "engine_starts": int(np.count_nonzero(trajectory.engine_on & ~before)),
         "shortfall_j": float(trajectory.shortfall_j.sum()),
         "dissipated_j": float(trajectory.dissipated_j.sum()),
         "trajectory_hash": trajectory_hash(trajectory),

@@ -6,32 +6,40 @@ The policy nodes beside it only declare their parameters and build their policy.
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
-from tractor_ems.answer import Answerer, RunGuard
+from tractor_ems.answer import Answerer, Observed, RunCheck
 from tractor_ems.policies.protocol import Policy
 from tractor_msgs_py import topics
-from tractor_msgs_py.codec import DECODERS, decode_run_info, encode
+from tractor_msgs_py.codec import (
+    decode_battery,
+    decode_power_demand,
+    decode_powertrain,
+    decode_run_info,
+    encode,
+)
 from tractor_msgs_py.errors import BagError
-from tractor_msgs_py.ros.diagnostics import PERIOD_S, diagnostic_array, diagnostics_publisher
-from tractor_msgs_py.ros.messages import CLASSES, RosMessages
-from tractor_msgs_py.ros.shell import Parameter, qos_profile, run_node
+from tractor_msgs_py.ros.diagnostics import PERIOD_S, diagnostic_array
+from tractor_msgs_py.ros.messages import RosMessages
+from tractor_msgs_py.ros.shell import Parameter, run_node
+from tractor_msgs_py.ros.wire import publish_on, subscribe_to
 from tractor_msgs_py.types import BatteryPowerCommand
 
+T = TypeVar("T")
 WATCHDOG_S = 0.05
+OBSERVED: tuple[tuple[topics.Topic, Callable[[Any], Observed]], ...] = (
+    (topics.POWER_DEMAND, decode_power_demand),
+    (topics.BATTERY, decode_battery),
+    (topics.POWERTRAIN, decode_powertrain),
+)
 COMMON = (
     Parameter("allow_other_powertrain", False, "drive a powertrain the policy was not made for"),
     Parameter(
-        "observation_timeout_s",
-        2.0,
-        "real time: fall back when nothing was observed for this long",
-        "s wall clock",
-        0.01,
-        60,
+        "observation_timeout_s", 2.0, "real time: fall back after silence of", "s", 0.01, 60
     ),
 )
 
@@ -43,12 +51,12 @@ class PolicySetup:
     Attributes:
         policy: the decision maker.
         powertrain_hash: the powertrain it was made for; None when any will do.
-        guard: further checks of runs and observations.
+        check_run: raises where the policy must not drive a run.
     """
 
     policy: Policy
     powertrain_hash: str | None = None
-    guard: RunGuard | None = None
+    check_run: RunCheck | None = None
 
 
 def run_policy_node(
@@ -62,7 +70,7 @@ def run_policy_node(
         setup = prepare(values)
         made_for = None if values["allow_other_powertrain"] else setup.powertrain_hash
         timeout_s = values["observation_timeout_s"]
-        return PolicyNode(node, Answerer(setup.policy, made_for, timeout_s, setup.guard))
+        return PolicyNode(node, Answerer(setup.policy, made_for, timeout_s, setup.check_run))
 
     return run_node(name, (*parameters, *COMMON), build)
 
@@ -73,51 +81,41 @@ class PolicyNode:
     def __init__(self, node: Node, answerer: Answerer) -> None:
         self._node, self._answerer, self._factory = node, answerer, RosMessages()
         self._other_policies = 0
-        self._commands = node.create_publisher(
-            CLASSES[topics.COMMAND.type], topics.COMMAND.name, qos_profile(topics.COMMAND.qos)
-        )
+        self._commands = publish_on(node, topics.COMMAND)
         # run_info comes first: callbacks that are ready together run in the order of creation.
-        self._subscribe(topics.RUN_INFO, self._on_run_info)
-        for topic in (topics.POWER_DEMAND, topics.BATTERY, topics.POWERTRAIN):
-            self._subscribe(topic, self._on_sample(topic))
-        self._diagnostics = diagnostics_publisher(node)
+        subscribe_to(node, topics.RUN_INFO, self._on_run_info)
+        for topic, decode in OBSERVED:
+            subscribe_to(node, topic, self._on_sample(topic, decode))
+        self._diagnostics = publish_on(node, topics.DIAGNOSTICS)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(WATCHDOG_S, self._watch, clock=steady)
         node.create_timer(PERIOD_S, self._diagnose, clock=steady)
 
-    def _subscribe(self, topic: topics.Topic, callback: Callable[[Any], None]) -> None:
-        self._node.create_subscription(
-            CLASSES[topic.type], topic.name, callback, qos_profile(topic.qos)
-        )
-
     def _on_run_info(self, msg: Any) -> None:
-        try:
-            run = decode_run_info(msg)
-        except BagError as error:
-            self._refuse("malformed_run_info", error)
-            return
-        self._answerer.start_run(run)
+        run = self._decoded(topics.RUN_INFO, decode_run_info, msg)
+        if run is not None:
+            self._answerer.start_run(run)
 
-    def _on_sample(self, topic: topics.Topic) -> Callable[[Any], None]:
-        decode = DECODERS[topic.name]
+    def _on_sample(
+        self, topic: topics.Topic, decode: Callable[[Any], Observed]
+    ) -> Callable[[Any], None]:
+        subscribers = self._commands.get_subscription_count
 
         def on_sample(msg: Any) -> None:
-            try:
-                sample = decode(msg)
-            except BagError as error:
-                self._refuse(f"malformed_{topic.name}", error)
-                return
-            self._publish(
-                self._answerer.observe(
-                    sample, self._commands.get_subscription_count, time.monotonic()
-                )
-            )
+            sample = self._decoded(topic, decode, msg)
+            if sample is not None:
+                self._publish(self._answerer.observe(sample, subscribers, time.monotonic()))
 
         return on_sample
 
-    def _refuse(self, reason: str, error: BagError) -> None:
-        self._answerer.refusals[reason] += 1
-        self._node.get_logger().warning(f"refused: {error}", throttle_duration_sec=1.0)
+    def _decoded(self, topic: topics.Topic, decode: Callable[[Any], T], msg: Any) -> T | None:
+        """The sample, or None where it is malformed: counted and reported."""
+        try:
+            return decode(msg)
+        except BagError as error:
+            self._answerer.refusals[f"malformed_{topic.name}"] += 1
+            self._node.get_logger().warning(f"refused: {error}", throttle_duration_sec=1.0)
+            return None
 
     def _publish(self, command: BatteryPowerCommand | None) -> None:
         if command is not None:
@@ -138,12 +136,10 @@ class PolicyNode:
             "policy": answerer.policy.name,
             "run_id": answerer.run.run_id if answerer.run else "",
             "other_policies": others,
-            "corrected": answerer.corrected,
-            "fallbacks": answerer.fallbacks,
-            **{f"refused_{name}": count for name, count in sorted(answerer.refusals.items())},
+            **answerer.counters,
         }
-        warning = others > 0 or answerer.corrected > 0 or answerer.fallbacks > 0
         state = "driving" if answerer.active else "waiting for a run"
+        warning = others > 0 or answerer.corrected > 0 or answerer.fallbacks > 0
         self._diagnostics.publish(diagnostic_array(self._node, state, values, warning=warning))
 
     def finished(self) -> int | None:

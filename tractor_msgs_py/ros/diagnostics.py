@@ -4,18 +4,9 @@ from collections.abc import Mapping
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
-from rclpy.publisher import Publisher
-
-from tractor_msgs_py.ros.shell import qos_profile
-from tractor_msgs_py.topics import DIAGNOSTICS
 
 PERIOD_S = 1.0
 """How often a node reports [s]."""
-
-
-def diagnostics_publisher(node: Node) -> Publisher:
-    """A publisher on the diagnostics topic."""
-    return node.create_publisher(DiagnosticArray, DIAGNOSTICS.name, qos_profile(DIAGNOSTICS.qos))
 
 
 def diagnostic_array(
