@@ -1,13 +1,12 @@
 """A killed recording is finalised by the recorder's own code; whatever is whole is kept."""
 
-import struct
 from pathlib import Path
 
 import pytest
 import yaml
+from bag_evidence import MAGIC, messages_of, whole_messages
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mcap.reader import make_reader
 
 from tractor_ems.bags import finalise as finalise_module
 from tractor_ems.bags.in_process import write_samples_bag
@@ -20,29 +19,6 @@ from tractor_msgs_py import topics
 from tractor_msgs_py.codec import encode
 from tractor_msgs_py.errors import BagError
 from tractor_msgs_py.trajectory import trajectory_hash
-
-MAGIC = b"\x89MCAP0\r\n"
-MESSAGE = 5
-
-
-def whole_messages(part: bytes) -> list[bytes]:
-    """CDR bytes of the complete message records of an unchunked file, without the MCAP library."""
-    found, at = [], len(MAGIC)
-    while at + 9 <= len(part):
-        opcode, length = struct.unpack_from("<BQ", part, at)
-        end = at + 9 + length
-        if end > len(part):
-            break
-        if opcode == MESSAGE:
-            found.append(part[at + 9 + 22 : end])
-        at = end
-    return found
-
-
-def messages_of(bag: Path) -> list[bytes]:
-    with next(bag.glob("*.mcap")).open("rb") as stream:
-        reader = make_reader(stream, validate_crcs=True)
-        return [m.data for _, _, m in reader.iter_messages(log_time_order=False)]
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,12 @@ PARAMETERS = (
     Parameter("output", "", "folder to create for the bag, required; an existing one is refused"),
     Parameter("runs", 1, "stop after this many complete runs, 0 for a signal", "", 0, 1_000_000),
     Parameter(
-        "idle_timeout_s", 0.0, "give up after this long without a message, 0 never", "s", 0, 86400
+        "idle_timeout_s",
+        0.0,
+        "give up when nothing follows the last message for this long, 0 never",
+        "s wall clock",
+        0,
+        86400,
     ),
 )
 
@@ -48,7 +53,7 @@ class BagRecorder:
         self._command_topic = node.resolve_topic_name(topics.COMMAND.name)
         self._commander_of = ""
         self._progress = Progress()
-        self._last_s = time.monotonic()
+        self._last_s: float | None = None
         self._closed = False
         channels = {node.resolve_topic_name(topic.name): topic for topic in topics.RECORDED}
         # run_info comes first: callbacks that are ready together run in the order of creation.
@@ -63,7 +68,7 @@ class BagRecorder:
 
     def _receiver(self, name: str, topic: topics.Topic) -> Callable[..., None]:
         def on_message(data: bytes, info: dict) -> None:
-            self._last_s = time.monotonic()
+            now_s = self._last_s = time.monotonic()
             self._writer.write(
                 name,
                 data,
@@ -71,7 +76,7 @@ class BagRecorder:
                 publish_time_ns=info["source_timestamp"],
                 sequence=info["publication_sequence_number"] or 0,
             )
-            self._progress.add(topic.name, data, self._last_s)
+            self._progress.add(topic.name, data, now_s)
             if topic is topics.COMMAND:
                 self._note_commander()
 
@@ -101,7 +106,7 @@ class BagRecorder:
         if self._runs and self._progress.runs >= self._runs:
             self._close()
             return 0
-        if self._idle_s and now_s - self._last_s > self._idle_s:
+        if self._idle_s and self._last_s is not None and now_s - self._last_s > self._idle_s:
             raise RunAborted(
                 f"no message for {self._idle_s:g} s, {self._progress.runs} complete runs so far"
             )
