@@ -115,7 +115,8 @@ def enumerate_actions(
     off_w = np.maximum(lb, ub)
     off_feasible = off_w >= power_demand_w
     ends_w = np.stack((power_demand_w - lb, power_demand_w - off_w), axis=1)
-    ends = running_cost(reward, params, np.maximum(ends_w, 0.0), ends_w > 0.0) / reward.cost_unit
+    engine_w = np.clip(ends_w, 0.0, table.engine_most_w)
+    ends = running_cost(reward, params, engine_w, ends_w > 0.0) / reward.cost_unit
     ends = np.where(ends_w > 0.0, ends, np.inf)
     running[batch, last] = ends[:, 1]
     running[batch, first] = np.where(first == last, ends[:, 1], ends[:, 0])

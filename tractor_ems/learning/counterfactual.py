@@ -153,7 +153,11 @@ def backup(
     params, reward = problem.params, problem.reward
     demand_w, inputs = problem.samples.power_demand_w[tick], problem.samples.inputs[tick]
     state = initial_state(params, soc, len(tick))
-    lb, ub = feasible_battery_power_w(power_limits(params, state), demand_w)
+    limits = power_limits(params, state)
+    lb, ub = feasible_battery_power_w(limits, demand_w)
+    lb = np.minimum(
+        lb, limits.discharge_w
+    )  # demand beyond engine and battery: both give their most
     actions = enumerate_actions(problem.table, reward, params, demand_w, lb, ub)
     start = start_cost(reward, params) / reward.cost_unit
 
