@@ -94,6 +94,13 @@ class SampledConfig:
     epsilon_start: Fraction = 1.0
     epsilon_end: Fraction = 0.05
 
+    def __post_init__(self) -> None:
+        if self.dp_share + self.rule_share > 1.0:
+            raise ConfigError(
+                f"sampled.rule_share: {self.rule_share} beside dp_share {self.dp_share}, "
+                "together allowed 0..1"
+            )
+
 
 @dataclass(frozen=True, config=_STRICT)
 class TrainConfig:

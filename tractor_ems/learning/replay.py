@@ -139,6 +139,8 @@ def distinct_rows(transitions: Transitions) -> NDArray[np.int64]:
     Two recordings of one run hold the same transitions; a buffer that repeats them would learn
     from fewer than it reports.
     """
+    if not len(transitions):
+        return np.zeros(0, dtype=np.int64)
     parts = [
         np.ascontiguousarray(column).reshape(len(transitions), -1).view(np.uint8)
         for column in columns(transitions).values()
@@ -157,7 +159,7 @@ def draw_seeds(
     Fewer than that seed what there is; none is ever repeated.
     """
     wanted = round(share * capacity)
-    distinct = distinct_rows(transitions) if len(transitions) else np.zeros(0, np.int64)
+    distinct = distinct_rows(transitions)
     chosen = rng.permutation(distinct)[:wanted]
     return transitions.take(chosen), Seeding(
         wanted, len(transitions), len(distinct), len(chosen), len(chosen) / capacity
