@@ -1,4 +1,4 @@
-"""What every bag must hold: the golden ones, or the user's own with ``pytest test/bag --bag PATH``.
+"""What every bag must hold: the golden ones, or your own (``pytest test/bag --bag PATH``).
 
 A check that a bag gives no data for (a recording of demand alone has no SOC) is skipped with its
 reason, so the closing line says what was not looked at.

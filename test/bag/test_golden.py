@@ -7,7 +7,7 @@ import pytest
 
 from tractor_ems.bags.check import check
 from tractor_ems.bags.inspect import info
-from tractor_ems.bags.read import find_bags, provenance_of
+from tractor_ems.bags.read import find_bags, provenance_of, read_bag
 from tractor_ems.bags.transitions import cycle_of_bag, iter_traces
 
 GOLDEN = Path(__file__).resolve().parents[2] / "bags"
@@ -49,7 +49,7 @@ def test_recorded_run_was_driven_by_the_node_it_is_named_after(name, policy):
 def test_golden_bag_names_no_path_of_the_machine_that_made_it(name):
     document = info(GOLDEN / name)
     commands = [v for k, v in document["provenance"].items() if k.endswith("command_line")]
-    commands += [t for run in _announced(GOLDEN / name) for t in [run]]
+    commands += [run.info.command_line for run in read_bag(GOLDEN / name) if run.info is not None]
     paths = [word for text in commands for word in shlex.split(text) if word.startswith("/")]
     assert paths == []
 
@@ -59,9 +59,3 @@ def test_demand_only_bag_is_one_stretch_of_demand_to_learn_from():
     assert trace.demand_only and trace.dt_s == 1.0
     assert trace.run_id == "" and trace.powertrain_hash == ""
     assert len(cycle_of_bag(GOLDEN / "demand_only")) == len(trace) >= 300
-
-
-def _announced(path: Path) -> list[str]:
-    from tractor_ems.bags.read import read_bag
-
-    return [run.info.command_line for run in read_bag(path) if run.info is not None]

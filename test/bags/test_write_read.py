@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import resource
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from rosbags.interfaces import QosDurability, QosReliability
 
 from tractor_ems.bags.in_process import record_in_process, write_samples_bag, write_trajectory_bag
 from tractor_ems.bags.read import bag_hash, find_bags, provenance_of, read_bag
+from tractor_ems.bags.recover import recover
 from tractor_ems.bags.rosbags_messages import definition, type_hash
 from tractor_ems.bags.runs import observations_of, trajectory_of
 from tractor_ems.bags.scan import scan_mcap
@@ -92,6 +94,19 @@ def test_writer_that_fails_midway_leaves_a_part_and_no_bag(tmp_path):
     assert [path.name for path in (tmp_path / "bag").iterdir()] == ["bag_0.mcap.part"]
     with pytest.raises(BagError, match="ems bag recover"):
         read_bag(tmp_path / "bag")
+
+
+def test_full_disk_is_one_line_and_keeps_what_was_flushed(tmp_path):
+    writer = BagWriter(tmp_path / "bag", {"/run_info": topics.RUN_INFO}, {})
+    writer.write("/run_info", b"\x00\x01\x00\x00\x01\x00\x00\x00\x00", 1, 1)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (writer.part.stat().st_size, hard))
+    try:
+        with pytest.raises(BagError, match=r"bag_0\.mcap\.part: cannot be written"):
+            writer.write("/run_info", bytes(100_000), 2, 2)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert sum(recover(tmp_path / "bag").messages.values()) == 1
 
 
 def test_mcap_has_chunks_an_index_and_valid_crcs(bag):

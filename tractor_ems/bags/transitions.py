@@ -205,25 +205,6 @@ def transitions_of(traces: Iterable[Trace]) -> Transitions:
     )
 
 
-def trace_json(trace: Trace) -> dict[str, Any]:
-    """Where a trace comes from and how long it is, as plain data."""
-    return {
-        "bag": trace.bag,
-        "bag_hash": trace.bag_hash,
-        "run_id": trace.run_id or None,
-        "cycle": trace.cycle or None,
-        "powertrain": trace.powertrain or None,
-        "policy": trace.policy or None,
-        "steps": len(trace),
-        "dt_s": trace.dt_s,
-        "demand_only": trace.demand_only,
-        "from_start": trace.from_start,
-        "to_end": trace.to_end,
-        "irregular": trace.irregular,
-        "refusals": trace.refusals,
-    }
-
-
 _FLAGS = ("engine_on", "next_engine_on", "truncated")
 _NONE: dict[str, NDArray[Any]] = {
     field.name: np.zeros(0, dtype=bool if field.name in _FLAGS else np.float64)

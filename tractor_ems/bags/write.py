@@ -6,7 +6,8 @@ is finalised (``finalise``), by the same code after a clean stop and after a cra
 """
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 
@@ -71,7 +72,7 @@ class BagWriter:
             raise BagError(f"{folder}: exists already, a recording overwrites nothing") from None
         except OSError as error:
             raise BagError(f"{folder}: cannot be created ({error.strerror})") from None
-        try:
+        with self._writing():
             self._file = self.part.open("xb")
             self._writer = Writer(
                 self._file,
@@ -85,8 +86,14 @@ class BagWriter:
             self.sync()
             sync_folder(folder)
             sync_folder(folder.parent)
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
         except OSError as error:
-            raise BagError(f"{self.part}: cannot be written ({error.strerror})") from None
+            reason = error.strerror or str(error)
+            raise BagError(f"{self.part}: cannot be written ({reason})") from None
 
     def _register(self, name: str, topic: Topic) -> int:
         schema = self._writer.register_schema(
@@ -112,7 +119,7 @@ class BagWriter:
         Raises:
             BagError: the file cannot be written, for instance because the disk is full.
         """
-        try:
+        with self._writing():
             self._writer.add_message(
                 self._channels[name],
                 log_time=log_time_ns,
@@ -121,19 +128,19 @@ class BagWriter:
                 sequence=sequence & _UINT32,
             )
             self._file.flush()
-        except OSError as error:
-            raise BagError(f"{self.part}: cannot be written ({error.strerror})") from None
         self.messages += 1
 
     def note(self, provenance: Mapping[str, str]) -> None:
         """Add to the provenance, now: a later value of a key replaces an earlier one."""
-        self._writer.add_metadata(PROVENANCE, dict(provenance))
-        self._file.flush()
+        with self._writing():
+            self._writer.add_metadata(PROVENANCE, dict(provenance))
+            self._file.flush()
 
     def sync(self) -> None:
         """Bring everything to the disk; call it about once a second."""
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        with self._writing():
+            self._file.flush()
+            os.fsync(self._file.fileno())
 
     def close(self) -> Finalised:
         """Finalise the bag.
@@ -141,11 +148,8 @@ class BagWriter:
         Raises:
             BagError: it cannot be written; the part file stays and ``recover`` tries again.
         """
-        try:
-            self.sync()
-            self._file.close()
-        except OSError as error:
-            raise BagError(f"{self.part}: cannot be written ({error.strerror})") from None
+        self.sync()
+        self._file.close()
         return finalise(self.part, recovered=False)
 
     def discard(self) -> None:
