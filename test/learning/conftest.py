@@ -1,7 +1,7 @@
 """Short recordings to learn from: in memory as traces, and on disk as bags."""
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ import pytest
 from tractor_ems.bags.in_process import record_in_process
 from tractor_ems.bags.transitions import Trace
 from tractor_ems.drive import drive
+from tractor_ems.learning.networks import one_thread
 from tractor_ems.learning.recorded import drive_of_trajectory
 from tractor_ems.policies.protocol import Policy
 from tractor_ems.policies.rules import BestPoint, RuleBased
@@ -20,6 +21,13 @@ from tractor_sim.powertrain import PowertrainParams
 from tractor_sim.powertrain_json import powertrain_hash
 
 MakeTraces = Callable[..., list[Trace]]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def single_thread() -> Iterator[None]:
+    """As in a training run; two threads for nets this small only wait for each other."""
+    with one_thread():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,5 @@
 """Counterfactual targets against the plant itself, and what the learned policy does with them."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +16,7 @@ from tractor_ems.learning.counterfactual import (
     demand_baseline,
     make_problem,
 )
-from tractor_ems.learning.networks import Net, one_thread, to_numpy
+from tractor_ems.learning.networks import Net, to_numpy
 from tractor_ems.learning.rewards import RewardConfig, battery_price, resolve, start_cost
 from tractor_ems.learning.samples import demand_samples, demand_scaling, observation_spec
 from tractor_ems.policies.mlp import forward
@@ -35,12 +34,6 @@ from tractor_sim.powertrain import (
 )
 
 GAMMA = 0.9
-
-
-@pytest.fixture(autouse=True)
-def single_thread() -> Iterator[None]:
-    with one_thread():
-        yield
 
 
 def problem_of(
@@ -169,11 +162,20 @@ def learn(paper: PowertrainParams, config: CounterfactualConfig) -> QPolicy:
     )
 
 
-def test_a_short_training_sustains_charge_at_the_engines_best_point(paper: PowertrainParams):
-    """500 updates from demand alone, driven on cycles it has not seen, to three targets."""
-    policy = learn(paper, CounterfactualConfig(updates=500))
+@pytest.fixture(scope="module")
+def far_sighted(paper: PowertrainParams) -> QPolicy:
+    """500 updates from the demand of three cycles."""
+    return learn(paper, CounterfactualConfig(updates=500))
+
+
+def test_a_short_training_sustains_charge_at_the_engines_best_point(
+    paper: PowertrainParams, far_sighted: QPolicy
+):
+    """Driven on cycles it has not seen, to three targets."""
     demand = np.stack([load_cycle(f"planter_{seed}").power_demand_w for seed in (81, 82, 83)])
-    runs = drive(policy, paper, demand, np.array([0.85, 0.80, 0.88]), np.array([0.836, 0.8, 0.84]))
+    runs = drive(
+        far_sighted, paper, demand, np.array([0.85, 0.80, 0.88]), np.array([0.836, 0.8, 0.84])
+    )
     for run, target in zip(runs, (0.836, 0.80, 0.84), strict=True):
         assert abs(run.soc_final - target) < 0.02
         efficiency = run.engine_power_w.sum() / (run.fuel_kg.sum() * 42.8e6)
@@ -181,10 +183,11 @@ def test_a_short_training_sustains_charge_at_the_engines_best_point(paper: Power
         assert run.shortfall_j.sum() == 0.0
 
 
-def test_learning_pays_for_a_start_that_greed_never_makes(paper: PowertrainParams):
+def test_learning_pays_for_a_start_that_greed_never_makes(
+    paper: PowertrainParams, far_sighted: QPolicy
+):
     """The myopic trap: a start pays back over many steps, never within one, so the same costs
     without a future run the battery down."""
-    far_sighted = learn(paper, CounterfactualConfig(updates=500))
     greedy = replace(far_sighted, gamma=0.0)
     demand = load_cycle("planter_84").power_demand_w[None, :]
     (wise,), (trapped,) = (drive(p, paper, demand, 0.836, 0.836) for p in (far_sighted, greedy))

@@ -102,7 +102,7 @@ def test_learner_reaches_q_star_of_a_small_mdp(double: bool):
     replay = Replay(100, STATES)
     replay.add(transitions(rows, STATES))
     config = SampledConfig(
-        updates=3000, batch=32, learning_rate=5e-3, target_rate=0.05, hidden=(32,), double=double
+        updates=1500, batch=32, learning_rate=5e-3, target_rate=0.1, hidden=(32,), double=double
     )
     learner = SampledLearner(
         STATES, ACTIONS, config, replay, np.random.default_rng(0), np.random.default_rng(1)
@@ -189,13 +189,13 @@ def test_double_overestimates_less_on_a_noisy_bandit():
         copy_towards(target, online, 1.0)
         optimiser = torch.optim.SGD(online.parameters(), lr=0.5)
         seen = []
-        for step in range(3000):
+        for step in range(1500):
             rows = [(0, 0, 0.0, 0.9, 1, 0, 9)]
             rows += [(1, arm, rng.normal(), 0.0, 1, 0, 9) for arm in range(10)]
             td_update(online, target, optimiser, transitions(rows, 2), double=double, loss="mse")
             if step % 50 == 49:
                 copy_towards(target, online, 1.0)
-            if step > 500:
+            if step >= 300:
                 seen.append(forward(to_numpy(online), np.eye(2, dtype=np.float32))[0, 0])
         learned[double] = float(np.mean(seen))
     assert learned[False] > 0.1

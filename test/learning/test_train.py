@@ -1,6 +1,7 @@
 """Training runs from bags: repeatable and resumable to the byte, and clear about bad input."""
 
 import json
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -43,11 +44,10 @@ MODES = pytest.mark.parametrize("mode", CONFIGS)
 RESUME = """
 import sys
 from pathlib import Path
-from test_train import CONFIGS
-from tractor_ems.learning.train import train
-mode, bags, out = sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3])
-report = train(CONFIGS[mode], [bags / "best"], [bags / "rule"], out, resume=True, command_line="x")
-print(report.updates)
+from test_train import CONFIGS, run
+bags, folder = Path(sys.argv[1]), Path(sys.argv[2])
+for mode in CONFIGS:
+    print(run(mode, bags, folder / f"{mode}.safetensors", resume=True).updates)
 """
 
 
@@ -75,26 +75,46 @@ def test_same_seed_same_bytes_and_another_seed_others(mode: str, bags: Path, tmp
     )
 
 
-@MODES
-def test_a_resumed_run_equals_an_unbroken_one_to_the_byte(mode: str, bags: Path, tmp_path: Path):
-    """Interrupted after 30 of 60 updates, resumed in a process of its own."""
-    whole, halves = tmp_path / "whole.safetensors", tmp_path / "halves.safetensors"
-    run(mode, bags, whole)
-    asked = iter(range(1, 100))
-    report = run(mode, bags, halves, stop=lambda: next(asked) == 30)
-    assert (report.updates, report.policy) == (30, None)
-    assert report.checkpoint == str(checkpoint_path(halves))
-    assert not halves.exists()
+def test_resumed_runs_equal_unbroken_ones_to_the_byte(bags: Path, tmp_path: Path):
+    """Interrupted after 30 of 60 updates, resumed in a process of its own; both modes."""
+    for mode in CONFIGS:
+        run(mode, bags, tmp_path / f"whole_{mode}.safetensors")
+        out, asked = tmp_path / f"{mode}.safetensors", iter(range(1, 100))
+        report = run(mode, bags, out, stop=lambda asked=asked: next(asked) == 30)
+        assert (report.updates, report.policy) == (30, None)
+        assert report.checkpoint == str(checkpoint_path(out))
+        assert not out.exists()
     done = subprocess.run(
-        [sys.executable, "-c", RESUME, mode, str(bags), str(halves)],
+        [sys.executable, "-c", RESUME, str(bags), str(tmp_path)],
         cwd=Path(__file__).parent,
         text=True,
         capture_output=True,
         timeout=240,
     )
-    assert done.stdout.strip() == "60", done.stdout + done.stderr
-    assert halves.read_bytes() == whole.read_bytes()
-    assert not checkpoint_path(halves).exists()
+    assert done.stdout.split() == ["60", "60"], done.stdout + done.stderr
+    for mode in CONFIGS:
+        out = tmp_path / f"{mode}.safetensors"
+        assert out.read_bytes() == (tmp_path / f"whole_{mode}.safetensors").read_bytes()
+        assert not checkpoint_path(out).exists()
+
+
+def test_ctrl_c_waits_for_the_update_and_leaves_a_checkpoint(bags: Path, tmp_path: Path):
+    config = replace(CONFIGS["counterfactual"], checkpoint_every=10_000)
+    config = replace(config, counterfactual=replace(config.counterfactual, updates=500))
+    whole, out = tmp_path / "whole.safetensors", tmp_path / "p.safetensors"
+    train(config, [bags / "best"], [], whole, command_line="x")
+
+    def interrupt(step: int, _metrics: dict[str, float]) -> None:
+        if step == 200:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        train(config, [bags / "best"], [], out, progress=interrupt)
+    assert checkpoint_path(out).is_file() and not out.exists()
+    train(config, [bags / "best"], [], out, resume=True, command_line="x")
+    assert out.read_bytes() == whole.read_bytes()
+    steps = [json.loads(line)["step"] for line in (tmp_path / "p.jsonl").read_text().splitlines()]
+    assert steps == [100, 200, 300, 400, 500]
 
 
 def test_a_policy_file_says_where_it_came_from(bags: Path, tmp_path: Path):
