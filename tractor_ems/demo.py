@@ -136,7 +136,7 @@ def _train(out: Path, config: DemoConfig, bags: list[dict[str, Any]], tell: Say)
             targets, {"powertrain": config.powertrain, "seed": config.seed}
         )
         report = train(settings, experts, rules, path, command_line="ems demo")
-        training[targets] = {"policy": str(path.relative_to(out)), **report.to_json()}
+        training[targets] = report.to_json() | {"policy": str(path.relative_to(out))}
         tell(f"trained ddqn_{targets} offline, {settings.updates} updates")
     return training
 
@@ -146,7 +146,8 @@ def _drive(
 ) -> tuple[list[Result], dict[str, dict[str, Trajectory]]]:
     """Every policy over every held-out cycle: what was learnt through the nodes, the rest
     in-process, where the trajectory is the same."""
-    results, runs = [], {}
+    results: list[Result] = []
+    runs: dict[str, dict[str, Trajectory]] = {}
     for cycle in config.held_out_cycles:
         scenario = _scenario(config, cycle)
         runs[cycle] = {}

@@ -31,14 +31,20 @@ def evaluate(
     Raises:
         TractorEmsError: bad input, or a run that was aborted.
     """
-    made = make_policy(policy, scenario, allow_other_powertrain=allow_other_powertrain)
     if transport == "ros":
         from tractor_ems.ros_run import run_ros
 
-        trajectory = run_ros(
-            _policy_arguments(policy, scenario, allow_other_powertrain), scenario, record=record
-        ).trajectory
-    elif record is not None:
+        # The node solves its own cycle; anything else is made here too, to refuse it early.
+        name = policy
+        if policy != "dp":
+            name = make_policy(
+                policy, scenario, allow_other_powertrain=allow_other_powertrain
+            ).name
+        node = _policy_arguments(policy, scenario, allow_other_powertrain)
+        trajectory = run_ros(node, scenario, record=record).trajectory
+        return score(name, scenario, trajectory, transport), trajectory
+    made = make_policy(policy, scenario, allow_other_powertrain=allow_other_powertrain)
+    if record is not None:
         from tractor_ems.bags.in_process import record_in_process
 
         trajectory = record_in_process(made, scenario, record)

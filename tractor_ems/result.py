@@ -5,9 +5,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tractor_sim.fuel import gallons
 from tractor_msgs_py.trajectory import Trajectory, trajectory_hash
 from tractor_sim.duty_cycle.cycle import DutyCycle
+from tractor_sim.fuel import gallons
 from tractor_sim.powertrain import PowertrainParams
 
 Transport = Literal["in_process", "ros"]
