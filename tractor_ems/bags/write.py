@@ -64,6 +64,7 @@ class BagWriter:
         self.folder = folder
         self.part = folder / f"{folder.name}_0.mcap{PART_SUFFIX}"
         self.messages = 0
+        self._schemas: dict[str, int] = {}
         if not folder.name:
             raise BagError(f"{folder}: a bag needs a folder name of its own")
         try:
@@ -96,14 +97,17 @@ class BagWriter:
             raise BagError(f"{self.part}: cannot be written ({reason})") from None
 
     def _register(self, name: str, topic: Topic) -> int:
-        schema = self._writer.register_schema(
-            topic.type, SchemaEncoding.ROS2, definition(topic.type).encode()
-        )
+        if topic.type not in self._schemas:
+            self._schemas[topic.type] = self._writer.register_schema(
+                topic.type, SchemaEncoding.ROS2, definition(topic.type).encode()
+            )
         metadata = {
             "offered_qos_profiles": qos_profiles(topic.qos),
             "topic_type_hash": type_hash(topic.type),
         }
-        return self._writer.register_channel(name, MessageEncoding.CDR, schema, metadata)
+        return self._writer.register_channel(
+            name, MessageEncoding.CDR, self._schemas[topic.type], metadata
+        )
 
     def write(
         self, name: str, data: bytes, log_time_ns: int, publish_time_ns: int, sequence: int = 0
