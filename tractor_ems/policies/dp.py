@@ -113,7 +113,7 @@ class DpPolicy:
         """Shape (B, candidates), limits aside. Knots, off among them, and the landing come
         before the grid, so that a tie goes to them; lb and ub come out of the projection."""
         grid_w = self._grid_w
-        landing_w = landing_power_w(self.params, soc, self.solution.soc_grid[k + 1, -2])
+        landing_w = landing_power_w(self.params, soc, self.solution.landing_soc[k])
         every_w = np.broadcast_to(grid_w, (len(soc), len(grid_w)))
         return np.concatenate([demand_w - self._knots_w, landing_w[:, None], every_w], axis=1)
 
