@@ -142,9 +142,11 @@ def test_a_ramp_limit_is_refused_in_one_line(paper: PowertrainParams):
         problem_of(ramped, RewardConfig(), [demand], CounterfactualConfig())
 
 
-def learn(paper: PowertrainParams, config: CounterfactualConfig) -> QPolicy:
+def learn(
+    paper: PowertrainParams, config: CounterfactualConfig, reward: RewardConfig | None = None
+) -> QPolicy:
     demands = [load_cycle(f"planter_{seed}").power_demand_w for seed in (21, 22, 23)]
-    problem = problem_of(paper, RewardConfig(), demands, config)
+    problem = problem_of(paper, reward or RewardConfig(), demands, config)
     learner = CounterfactualLearner(
         problem, config, np.random.default_rng(0), np.random.default_rng(1)
     )
@@ -193,3 +195,13 @@ def test_learning_pays_for_a_start_that_greed_never_makes(
     (wise,), (trapped,) = (drive(p, paper, demand, 0.836, 0.836) for p in (far_sighted, greedy))
     assert wise.soc_final > 0.82
     assert trapped.soc_final < 0.80
+
+
+@pytest.mark.parametrize("kind", ["fuel", "piecewise"])
+def test_rewards_that_do_not_price_the_battery_run_it_down(paper: PowertrainParams, kind: str):
+    """The printed shaped reward too: engine off earns more than any engine point."""
+    policy = learn(paper, CounterfactualConfig(updates=100), RewardConfig(kind=kind))  # type: ignore[arg-type]
+    demand = load_cycle("planter_85").power_demand_w[None, :400]
+    run = drive(policy, paper, demand, 0.75, 0.75)[0]
+    assert run.soc_final < 0.702
+    assert run.shortfall_j.sum() == 0.0
