@@ -39,10 +39,11 @@ class Peers:
 class StartGate:
     """Holds the first tick until one policy and the expected recorders are connected.
 
-    ``match_timeout_s`` of 0 waits for ever.
+    ``match_timeout_s`` of 0 waits for ever. ``missing`` says for whom it waits.
     """
 
     def __init__(self, expected_recorders: int, match_timeout_s: float) -> None:
+        self.missing = ""
         self._needed = 1 + expected_recorders
         self._timeout_s = match_timeout_s
         self._since_s: float | None = None
@@ -54,19 +55,18 @@ class StartGate:
             RunAborted: nobody came within the timeout, or more than one policy did.
         """
         refuse_second_policy(peers.command_publishers)
-        if (
-            peers.command_publishers == 1
-            and peers.observation_subscribers >= self._needed
-            and peers.run_info_delivered
-        ):
+        enough = peers.observation_subscribers >= self._needed
+        if peers.command_publishers == 1 and enough and peers.run_info_delivered:
+            self.missing = ""
             return True
+        self.missing = (
+            f"{peers.command_publishers} of 1 publishers on {topics.COMMAND.name}, "
+            f"{peers.observation_subscribers} of {self._needed} subscribers of the observation, "
+            f"{topics.RUN_INFO.name} {'' if peers.run_info_delivered else 'not '}delivered"
+        )
         self._since_s = now_s if self._since_s is None else self._since_s
         if 0.0 < self._timeout_s < now_s - self._since_s:
-            raise RunAborted(
-                f"not started within {self._timeout_s:g} s: {peers.command_publishers} of 1 "
-                f"publishers on {topics.COMMAND.name}, {peers.observation_subscribers} of "
-                f"{self._needed} subscribers of the observation topics"
-            )
+            raise RunAborted(f"not started within {self._timeout_s:g} s: {self.missing}")
         return False
 
 
@@ -85,6 +85,7 @@ class Lockstep:
     command is refused and counted.
 
     Attributes:
+        gate: holds the start.
         refusals: commands by what was wrong with them.
         resends: ticks published again.
     """
@@ -96,7 +97,7 @@ class Lockstep:
         self.refusals: Counter[str] = Counter()
         self.resends = 0
         self.started = False
-        self._gate = StartGate(run.info.expected_recorders, match_timeout_s)
+        self.gate = StartGate(run.info.expected_recorders, match_timeout_s)
         self._answer_timeout_s = answer_timeout_s
         self._tick_since_s = 0.0
         self._sent_s = 0.0
@@ -117,7 +118,7 @@ class Lockstep:
         Raises:
             RunAborted: nobody came within the timeout, or more than one policy did.
         """
-        if not self._gate.open(peers, now_s):
+        if not self.gate.open(peers, now_s):
             return ()
         self.started = True
         return self._send(now_s)

@@ -30,6 +30,7 @@ class RealTime:
     tick that it answers was published, so a policy that lags counts as stale like a dead one.
 
     Attributes:
+        gate: holds the start.
         refusals: commands by what was wrong with them.
         fallback_ticks: steps driven by the fallback law.
     """
@@ -45,7 +46,7 @@ class RealTime:
         self.refusals: Counter[str] = Counter()
         self.fallback_ticks = 0
         self.started = False
-        self._gate = StartGate(run.info.expected_recorders, match_timeout_s)
+        self.gate = StartGate(run.info.expected_recorders, match_timeout_s)
         self._period_s = period_s
         self._timeout_s = command_timeout_s
         self._due_s = 0.0
@@ -68,7 +69,7 @@ class RealTime:
         Raises:
             RunAborted: nobody came within the timeout, or more than one policy did.
         """
-        if not self._gate.open(peers, now_s):
+        if not self.gate.open(peers, now_s):
             return ()
         self.started = True
         self._due_s = now_s

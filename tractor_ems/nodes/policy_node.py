@@ -80,7 +80,6 @@ class PolicyNode:
 
     def __init__(self, node: Node, answerer: Answerer) -> None:
         self._node, self._answerer, self._factory = node, answerer, RosMessages()
-        self._other_policies = 0
         self._commands = publish_on(node, topics.COMMAND)
         # run_info comes first: callbacks that are ready together run in the order of creation.
         subscribe_to(node, topics.RUN_INFO, self._on_run_info)
@@ -125,21 +124,20 @@ class PolicyNode:
         self._publish(self._answerer.overdue(time.monotonic()))
 
     def _diagnose(self) -> None:
-        others = self._node.count_publishers(topics.COMMAND.name) - 1
-        if others > self._other_policies:
+        count, name = self._node.count_publishers(topics.COMMAND.name), topics.COMMAND.name
+        if count > 1:
             self._node.get_logger().error(
-                f"{others + 1} publishers on {topics.COMMAND.name}, allowed 1"
+                f"{count} publishers on {name}, allowed 1", throttle_duration_sec=10.0
             )
-        self._other_policies = others
         answerer = self._answerer
         values = {
             "policy": answerer.policy.name,
             "run_id": answerer.run.run_id if answerer.run else "",
-            "other_policies": others,
+            "other_policies": count - 1,
             **answerer.counters,
         }
         state = "driving" if answerer.active else "waiting for a run"
-        warning = others > 0 or answerer.corrected > 0 or answerer.fallbacks > 0
+        warning = count > 1 or answerer.corrected > 0 or answerer.fallbacks > 0
         self._diagnostics.publish(diagnostic_array(self._node, state, values, warning=warning))
 
     def finished(self) -> int | None:

@@ -30,6 +30,7 @@ from tractor_msgs_py.topics import Qos
 
 SPIN_S = 0.1
 _BUILT_IN = ("use_sim_time", "start_type_description_service")
+_BAD_ARGUMENTS = (RCLError, UnknownROSArgsError, ValueError)
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,10 @@ def run_node(
     the parameters.
     """
     args = list(sys.argv if argv is None else argv)
-    rest = remove_ros_args(args)[1:]
+    try:
+        rest = remove_ros_args(args)[1:]
+    except _BAD_ARGUMENTS as error:
+        return _complain(name, error)
     if "-h" in rest or "--help" in rest:
         print(f"ros2 run tractor_ems {name} --ros-args [-p NAME:=VALUE ...]\n")
         for parameter in parameters:
@@ -161,9 +165,8 @@ def run_node(
         signal.signal(number, on_signal)
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    except (RCLError, UnknownROSArgsError, ValueError) as error:
-        print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+    except _BAD_ARGUMENTS as error:
+        return _complain(name, error)
     node: Node | None = None
     executor: SingleThreadedExecutor | None = None
     logic: Logic | None = None
@@ -180,8 +183,7 @@ def run_node(
     except ExternalShutdownException:
         return 0
     except TractorEmsError as error:
-        print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
-        return error.exit_code
+        return _complain(name, error, error.exit_code)
     finally:
         try:
             if logic is not None:
@@ -192,3 +194,9 @@ def run_node(
             if node is not None:
                 node.destroy_node()
             try_shutdown()
+
+
+def _complain(name: str, error: Exception, code: int = 2) -> int:
+    """One line on stderr; returns the exit code."""
+    print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
+    return code

@@ -104,7 +104,10 @@ class PlantSim:
 
     def _diagnose(self) -> None:
         counters = self._pace.counters
-        state = "driving" if self._pace.started else "waiting for a policy"
+        missing = self._pace.gate.missing
+        state = f"waiting: {missing}" if missing else "driving"
+        if missing:
+            self._node.get_logger().info(state, throttle_duration_sec=30.0)
         values = {"tick": self._run.k, "steps": self._run.info.steps, **counters}
         self._diagnostics.publish(
             diagnostic_array(self._node, state, values, warning=self._pace.refusals.total() > 0)
