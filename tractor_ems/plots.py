@@ -81,7 +81,7 @@ def _operating_points(
         axes.scatter(
             centres_w[used] / 1e3,
             efficiency(engine, centres_w[used]) * 100 + 0.9 * row,
-            s=1500 * counts[used] / len(run),
+            s=700 * counts[used] / len(run),
             color=colour,
             alpha=0.6,
             edgecolors="none",
@@ -89,6 +89,7 @@ def _operating_points(
         )
     axes.set_xlabel("engine power [kW]; area: share of time; rows offset by 0.9 points")
     axes.set_ylabel("efficiency [%]")
+    axes.set_ylim(0, max(engine.curve_efficiency) * 100 + 9)
     legend = axes.legend(fontsize="small", loc="lower right")
     for handle in legend.legend_handles:
         if handle is not None and hasattr(handle, "set_sizes"):

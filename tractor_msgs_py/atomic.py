@@ -36,7 +36,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_json(path: Path, document: Any) -> None:
-    """Write one JSON document; a number that is not finite raises ValueError and writes nothing."""
+    """Write one JSON document; a number that is not finite raises ValueError, nothing stays."""
     write_bytes(path, (json.dumps(document, indent=2, allow_nan=False) + "\n").encode())
 
 

@@ -40,6 +40,7 @@ POWERTRAIN_NAMES = (
     "shortfall_j",
     "dissipated_j",
 )
+_POWERTRAIN_FIELDS = tuple(field.name for field in dataclasses.fields(PowertrainReading))[1:]
 
 
 class MessageFactory(Protocol):
@@ -114,7 +115,7 @@ def decode_battery(msg: Any) -> BatteryReading:
 
 def encode_powertrain(sample: PowertrainReading, factory: MessageFactory) -> Any:
     """PowertrainReading to a message."""
-    efforts = [float(value) for value in dataclasses.astuple(sample)[1:]]
+    efforts = [float(getattr(sample, name)) for name in _POWERTRAIN_FIELDS]
     return factory.joint_state(sample.stamp_ns, POWERTRAIN_NAMES, efforts)
 
 

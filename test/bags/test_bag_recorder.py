@@ -1,6 +1,7 @@
 """The recorder as a process: what it records, when it stops, what it leaves, how it ends."""
 
 import signal
+import time
 from dataclasses import replace
 
 import pytest
@@ -118,7 +119,6 @@ def test_two_runs_with_the_same_stamps_go_into_one_bag(
 @pytest.mark.parametrize(
     ("parameters", "output", "message"),
     [
-        ((), None, "parameter output: is empty"),
         (("runs:=-1",), "rec", "parameter runs"),
         (("ruins:=1",), "rec", "parameter ruins: unknown"),
         ((), "there", "exists already"),
@@ -133,3 +133,15 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert error.startswith("bag_recorder: ") and message in error and error.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["there"]
     assert list((tmp_path / "there").iterdir()) == []
+
+
+def test_a_bag_without_a_name_is_named_after_the_time(start_recorder, tmp_path):
+    recorder = start_recorder(output=None)
+    deadline_s = time.monotonic() + 60.0
+    while not list(tmp_path.iterdir()):
+        assert time.monotonic() < deadline_s, recorder.end(signal.SIGKILL)
+        time.sleep(0.05)
+    (begun,) = tmp_path.iterdir()
+    assert begun.name.startswith("tractor_ems_20")
+    assert recorder.end(signal.SIGTERM)[0] == 0
+    assert list(tmp_path.iterdir()) == [], "nothing was received, nothing stays"

@@ -5,13 +5,7 @@ from typing import Annotated
 import typer
 
 from tractor_ems.cli.evaluate import Cycle, Powertrain, Soc0
-from tractor_ems.cli.output import (
-    RESULT_COLUMNS,
-    JsonFlag,
-    print_json,
-    print_table,
-    result_row,
-)
+from tractor_ems.cli.output import JsonFlag, print_json, print_result, print_table
 
 
 def dp(
@@ -36,17 +30,16 @@ def dp(
     if certify:
         from tractor_ems.optimal.certificate import certify as certify_dp
 
-        certificate = certify_dp(
+        document["certificate"] = certify_dp(
             scenario.params,
             scenario.power_demand_w,
             soc_initial=scenario.soc_initial,
             soc_final=scenario.soc_target,
-        )
-        document["certificate"] = certificate.to_json()
+        ).to_json()
     if json:
         print_json(document)
         return
-    print_table("", RESULT_COLUMNS, [result_row(document)])
-    if certify:
-        rows = list(document["certificate"].items())
-        print_table("certificate", ("quantity", "value"), rows)
+    certificate = document.pop("certificate", None)
+    print_result(document)
+    if certificate is not None:
+        print_table("certificate", ("quantity", "value"), list(certificate.items()))

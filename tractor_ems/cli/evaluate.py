@@ -5,13 +5,7 @@ from typing import Annotated
 
 import typer
 
-from tractor_ems.cli.output import (
-    RESULT_COLUMNS,
-    JsonFlag,
-    print_json,
-    print_table,
-    result_row,
-)
+from tractor_ems.cli.output import JsonFlag, print_json, print_result
 from tractor_ems.result import Transport
 from tractor_msgs_py.errors import ConfigError
 
@@ -66,5 +60,4 @@ def evaluate(
     if json:
         print_json(result.to_json())
         return
-    print_table("", RESULT_COLUMNS, [result_row(result.to_json())])
-    print(f"trajectory hash {result.trajectory_hash}")
+    print_result(result.to_json())

@@ -2,7 +2,8 @@
 
 import json
 import math
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Any
 
 import typer
@@ -27,7 +28,8 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]
         table.add_column(column, justify="left" if position == 0 else "right")
     for row in rows:
         table.add_row(*(shown(value) for value in row))
-    Console().print(table)
+    # A pipe or a narrow log gets whole cells rather than cut ones.
+    Console(width=None if sys.stdout.isatty() else 160).print(table)
 
 
 def shown(value: Any) -> str:
@@ -39,35 +41,20 @@ def shown(value: Any) -> str:
     if isinstance(value, float):
         if not math.isfinite(value):
             return str(value)
-        return f"{value:.4f}" if abs(value) < 100 else f"{value:,.0f}"
+        return f"{value:.4f}" if 1e-3 <= abs(value) < 100 or value == 0 else f"{value:.4g}"
+    if isinstance(value, list) and len(value) > 6:
+        return f"{len(value)} of them"
     return str(value)
 
 
-RESULT_COLUMNS = (
-    "policy",
-    "cycle",
-    "fuel kg",
-    "fuel gal",
-    "efficiency",
-    "final SOC",
-    "target",
-    "starts",
-    "dp_ratio",
-    "violations",
-)
+def print_result(result: dict[str, Any]) -> None:
+    """Print one result, a quantity a line; nested objects by dotted name."""
+    print_table("", ("quantity", "value"), list(_flat(result)))
 
 
-def result_row(result: dict[str, Any]) -> tuple[Any, ...]:
-    """The cells of one result under RESULT_COLUMNS."""
-    return (
-        result["policy"],
-        result["cycle"] + (" (held out)" if result["held_out"] else ""),
-        result["fuel_kg"],
-        result["fuel_gal"],
-        result["efficiency"],
-        result["soc_final"],
-        result["soc_target"],
-        result["engine_starts"],
-        result["dp_ratio"],
-        result["violations"],
-    )
+def _flat(document: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in document.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value

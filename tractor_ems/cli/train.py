@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from tractor_ems.cli.output import NOTES, JsonFlag, print_json, print_table
+from tractor_ems.cli.output import NOTES, JsonFlag, print_json, print_result
 
 
 def train(
@@ -59,15 +59,12 @@ def train(
         "reward.kind": reward,
         "powertrain": powertrain,
         "seed": seed,
+        "updates": updates,
         "interact": interact,
         "sampled.rule_share": rule_share,
         "allow_other_powertrain": True if allow_other_powertrain else None,
     }
     config = load_train_config(preset or targets, overrides)
-    if updates is not None:
-        config = load_train_config(
-            preset or targets, overrides | {f"{config.targets}.updates": updates}
-        )
     with Progress(
         TextColumn("training"),
         BarColumn(),
@@ -98,4 +95,4 @@ def train(
     if json:
         print_json(report.to_json())
         return
-    print_table(f"wrote {out}", ("quantity", "value"), list(report.to_json().items()))
+    print_result(report.to_json())

@@ -20,7 +20,7 @@ from rclpy.node import Node
 from tractor_ems.bags.progress import Progress
 from tractor_ems.bags.write import BagWriter
 from tractor_msgs_py import topics
-from tractor_msgs_py.errors import BagError, ConfigError, RunAborted
+from tractor_msgs_py.errors import BagError, RunAborted
 from tractor_msgs_py.ros.messages import CLASSES
 from tractor_msgs_py.ros.shell import Parameter, qos_profile, run_node
 
@@ -29,7 +29,11 @@ QUEUE = 5000
 """Messages that may wait in a subscription; a depth of its own, matched with any publisher."""
 
 PARAMETERS = (
-    Parameter("output", "", "folder to create for the bag, required; an existing one is refused"),
+    Parameter(
+        "output",
+        "",
+        "folder to create for the bag; an existing one is refused; empty: named after the time",
+    ),
     Parameter("runs", 1, "stop after this many complete runs, 0 for a signal", "", 0, 1_000_000),
     Parameter(
         "idle_timeout_s",
@@ -46,8 +50,6 @@ class BagRecorder:
     """Hands raw messages to a ``BagWriter`` until ``Progress`` says that it is enough."""
 
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
-        if not values["output"]:
-            raise ConfigError("parameter output: is empty, give the folder of the new bag")
         self._node = node
         self._runs, self._idle_s = values["runs"], values["idle_timeout_s"]
         self._command_topic = node.resolve_topic_name(topics.COMMAND.name)
@@ -64,7 +66,8 @@ class BagRecorder:
             )
         node.create_timer(SYNC_S, self._sync, clock=Clock(clock_type=ClockType.STEADY_TIME))
         provenance = {"recorder": "bag_recorder", "recorder_command_line": shlex.join(sys.argv)}
-        self._writer = BagWriter(Path(values["output"]), channels, provenance)
+        output = values["output"] or time.strftime("tractor_ems_%Y_%m_%d-%H_%M_%S")
+        self._writer = BagWriter(Path(output), channels, provenance)
 
     def _receiver(self, name: str, topic: topics.Topic) -> Callable[..., None]:
         def on_message(data: bytes, info: dict) -> None:
