@@ -73,6 +73,7 @@ def train(
         TextColumn("{task.description}"),
         console=NOTES,
         transient=True,
+        disable=not NOTES.is_terminal,
     ) as bar:
         task = bar.add_task("", total=config.updates)
 
