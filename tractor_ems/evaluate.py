@@ -4,7 +4,7 @@ from pathlib import Path
 
 from tractor_ems.drive import drive
 from tractor_ems.optimal.score import dp_ratio
-from tractor_ems.policies.registry import make_policy, policy_file
+from tractor_ems.policies.registry import make_policy, node_of
 from tractor_ems.result import Result, Transport, summarise
 from tractor_ems.scenario import Scenario
 from tractor_msgs_py.trajectory import Trajectory
@@ -40,7 +40,7 @@ def evaluate(
             name = make_policy(
                 policy, scenario, allow_other_powertrain=allow_other_powertrain
             ).name
-        node = _policy_arguments(policy, scenario, allow_other_powertrain)
+        node = node_of(policy, scenario, allow_other_powertrain=allow_other_powertrain)
         trajectory = run_ros(node, scenario, record=record).trajectory
         return score(name, scenario, trajectory, transport), trajectory
     made = make_policy(policy, scenario, allow_other_powertrain=allow_other_powertrain)
@@ -78,17 +78,3 @@ def score(policy: str, scenario: Scenario, trajectory: Trajectory, transport: Tr
         transport=transport,
         dp_ratio=ratio,
     )
-
-
-def _policy_arguments(
-    policy: str, scenario: Scenario, allow_other: bool
-) -> tuple[str, dict[str, object]]:
-    """Node executable and its parameters for a policy named by the user."""
-    if policy == "dp":
-        return "dp_policy", {}
-    if policy in ("conventional", "rule_based", "best_point", "myopic_greedy"):
-        return "rule_based_policy", {"policy": policy, "powertrain": scenario.powertrain_source}
-    return "ddqn_policy", {
-        "policy_file": str(policy_file(policy, scenario.params.name).resolve()),
-        "allow_other_powertrain": allow_other,
-    }

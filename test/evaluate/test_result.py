@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from tractor_ems.drive import drive
-from tractor_sim.fuel import gallons
 from tractor_ems.policies.rules import BestPoint, Conventional, MyopicGreedy, RuleBased
 from tractor_ems.result import count_violations, summarise
 from tractor_msgs_py.trajectory import trajectory_hash
 from tractor_sim.config import load_powertrain
 from tractor_sim.duty_cycle.library import load_cycle
+from tractor_sim.fuel import gallons
 
 PAPER = load_powertrain("paper")
 PLANTER = load_cycle("planter")

@@ -58,3 +58,17 @@ def make_policy(name: str, scenario: Scenario, *, allow_other_powertrain: bool =
     if not allow_other_powertrain:
         check_powertrain(policy, powertrain_hash(params))
     return policy
+
+
+def node_of(
+    policy: str, scenario: Scenario, *, allow_other_powertrain: bool = False
+) -> tuple[str, dict[str, object]]:
+    """Node executable and its parameters for a policy named by the user."""
+    if policy == "dp":
+        return "dp_policy", {}
+    if policy in RULES:
+        return "rule_based_policy", {"policy": policy, "powertrain": scenario.powertrain_source}
+    return "ddqn_policy", {
+        "policy_file": str(policy_file(policy, scenario.params.name).resolve()),
+        "allow_other_powertrain": allow_other_powertrain,
+    }
