@@ -1,0 +1,1 @@
+"""The optimum of a known cycle: dynamic programming, its certificate, and the score against it."""

@@ -102,12 +102,11 @@ class DpPolicy:
         after = soc_after(params.battery, soc[:, None], candidates_w, params.dt_s)
         cost_kg = engine_fuel_kg(params, demand_w - candidates_w)
         cost_kg = cost_kg + cost_to_go_kg(solution, k + 1, after)
-        chosen = np.argmin(cost_kg, axis=1)[:, None]
-        battery_w = np.take_along_axis(candidates_w, chosen, axis=1)[:, 0]
-        expected = np.take_along_axis(after, chosen, axis=1)[:, 0]
+        chosen = np.arange(len(soc)), np.argmin(cost_kg, axis=1)
+        battery_w = candidates_w[chosen]
         engine_off = battery_w >= observation.power_demand_w
         command = Command(battery_w, np.where(engine_off, 0.0, np.nan))
-        return command, DpMemory(t0_ns, expected)
+        return command, DpMemory(t0_ns, after[chosen])
 
     def _candidates_w(self, k: int, demand_w: FloatArray, soc: FloatArray) -> FloatArray:
         """Shape (B, candidates), limits aside. Knots, off among them, and the landing come
@@ -134,7 +133,7 @@ class DpPolicy:
                 f"the solved cycle has ticks 0..{len(solved_w) - 1} from {t0_ns} ns"
             )
         differs = ~(np.abs(observation.power_demand_w - solved_w[k]) <= ROUNDING_W)
-        if np.any(differs):
+        if differs.any():
             seen_w = observation.power_demand_w[np.argmax(differs)]
             raise RunAborted(
                 f"dp: tick {k}: power_demand is {seen_w} W, the solved cycle has {solved_w[k]} W"
@@ -142,11 +141,11 @@ class DpPolicy:
         return k
 
     def _check_soc(self, k: int, soc: FloatArray) -> None:
-        battery = self.params.battery
+        battery, row = self.params.battery, self.solution.soc_grid[k]
         step = battery.power_max_w * self.params.dt_s / battery.energy_j
-        low, high = self.solution.soc_grid[k, [0, -1]]
+        low, high = float(row[0]), float(row[-1])
         outside = ~((soc >= low - step) & (soc <= high + step))
-        if np.any(outside):
+        if outside.any():
             raise RunAborted(
                 f"dp: tick {k}: SOC is {soc[np.argmax(outside)]}, solved for {low}..{high} "
                 f"(a run from {self.solution.soc_initial} to {self.solution.soc_target})"
