@@ -28,6 +28,8 @@ class RealTime:
 
     A step over [t_k, t_k+1) is taken when it is over. A command's age is the wall time since the
     tick that it answers was published, so a policy that lags counts as stale like a dead one.
+    While two policies are connected neither is obeyed; one that was killed counts as connected
+    until the middleware's lease ends, about 20 s.
 
     Attributes:
         gate: holds the start.

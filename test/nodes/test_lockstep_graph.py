@@ -201,6 +201,17 @@ def test_no_policy_within_the_match_timeout_ends_the_run(graph, cycle):
         graph.drive(graph.plant(cycle=cycle, match_timeout_s=0.2))
 
 
+def test_a_plant_without_a_policy_says_for_whom_it_waits(graph, cycle):
+    people = graph.peer(topics.DIAGNOSTICS)
+    graph.plant(cycle=cycle)
+    shown = people.heard[topics.DIAGNOSTICS.name]
+    graph.spin_until(lambda: shown, "diagnostics")
+    (status,) = shown[-1].status
+    assert status.message.startswith("waiting: 0 of 1 publishers on battery_power_command")
+    values = {item.key: item.value for item in status.values}
+    assert (values["mode"], values["tick"], values["steps"]) == ("lockstep", "0", "12")
+
+
 def test_a_policy_for_another_powertrain_refuses_the_run(graph, cycle):
     graph.policy(Answerer(Conventional(), powertrain_hash="0" * 64))
     with pytest.raises(PolicyError, match="conventional was made for powertrain 0000"):

@@ -103,12 +103,13 @@ class PlantSim:
         self._publish(self._pace.offer(command, publishers, time.monotonic()))
 
     def _diagnose(self) -> None:
-        counters = self._pace.counters
         missing = self._pace.gate.missing
         state = f"waiting: {missing}" if missing else "driving"
         if missing:
             self._node.get_logger().info(state, throttle_duration_sec=30.0)
-        values = {"tick": self._run.k, "steps": self._run.info.steps, **counters}
+        info = self._run.info
+        mode = "lockstep" if info.lockstep else "real_time"
+        values = {"mode": mode, "tick": self._run.k, "steps": info.steps, **self._pace.counters}
         self._diagnostics.publish(
             diagnostic_array(self._node, state, values, warning=self._pace.refusals.total() > 0)
         )
