@@ -10,7 +10,6 @@ from tractor_ems.drive import drive
 from tractor_ems.policies.q_policy import load_policy
 from tractor_ems.policies.rules import RuleBased
 from tractor_msgs_py import topics
-from tractor_msgs_py.errors import ConfigError
 from tractor_msgs_py.trajectory import trajectory_hash
 from tractor_sim.config import load_powertrain
 from tractor_sim.duty_cycle.library import load_cycle
@@ -20,11 +19,11 @@ NODES = ("plant_sim", "rule_based_policy", "dp_policy", "ddqn_policy")
 LONG = 50_000
 
 
-def shipped_policy():
-    try:
+def default_policy(executable: str):
+    """What the executable decides with when it is started without parameters."""
+    if executable == "ddqn_policy":
         return load_policy(resource_path("data", "policy", "paper.safetensors"))
-    except ConfigError:
-        return None
+    return RuleBased(load_powertrain("paper"))
 
 
 @pytest.fixture
@@ -41,11 +40,7 @@ def planter_hash(policy) -> str:
 
 @pytest.mark.parametrize("executable", ["rule_based_policy", "ddqn_policy"])
 def test_plant_and_policy_started_by_hand_in_either_order_drive_the_planter(start, executable):
-    learned = executable == "ddqn_policy"
-    policy = shipped_policy() if learned else RuleBased(load_powertrain("paper"))
-    if policy is None:
-        pytest.skip("no policy ships yet")
-    expected = planter_hash(policy)[:16]
+    expected = planter_hash(default_policy(executable))[:16]
     node = start(executable)
     first = start("plant_sim")
     assert first.end() == 0, first.output
