@@ -4,6 +4,7 @@ without the transport, and batched."""
 import numpy as np
 
 from tractor_ems.policies.protocol import Policy
+from tractor_ems.safety import safe
 from tractor_msgs_py.codec import wire_soc
 from tractor_msgs_py.errors import PolicyError
 from tractor_msgs_py.observation import Observation, init_filters, update_filters
@@ -62,7 +63,8 @@ def drive(
             engine_limit_w=limits.engine_w,
             features=filters.values_w,
         )
-        command, memory = policy.act(observation, memory)
+        asked, memory = policy.act(observation, memory)
+        command = safe(observation, asked)
         soc = state.soc
         state, result = step(params, state, demand_w, command)
         row = (

@@ -5,9 +5,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tractor_msgs_py.trajectory import Trajectory, trajectory_hash
+from tractor_msgs_py.trajectory import Trajectory
 from tractor_sim.duty_cycle.cycle import DutyCycle
-from tractor_sim.fuel import gallons
+from tractor_sim.figures import run_figures
 from tractor_sim.powertrain import PowertrainParams
 
 Transport = Literal["in_process", "ros"]
@@ -24,7 +24,7 @@ class Result:
         policy, cycle, powertrain: names.
         held_out: the cycle is one that training must never see.
         fuel_kg, fuel_gal: fuel burnt, start fuel included.
-        efficiency: engine work over fuel energy; None when nothing was burnt.
+        efficiency: crankshaft work over fuel energy; None when nothing was burnt.
         soc_initial, soc_final, soc_target: fractions.
         engine_starts: number of engine starts.
         shortfall_j, dissipated_j: undelivered demand, braked-away energy [J].
@@ -71,29 +71,17 @@ def summarise(
     dp_ratio: float | None,
 ) -> Result:
     """The row of one run, computed from its trajectory alone."""
-    fuel_kg = float(trajectory.fuel_kg.sum())
-    work_j = float(trajectory.engine_power_w.sum()) * params.dt_s
-    fuel_j = fuel_kg * params.engine.fuel_lhv_j_per_kg
-    before = np.concatenate(([False], trajectory.engine_on[:-1]))
     return Result(
         policy=policy,
         cycle=cycle.name,
         powertrain=params.name,
         held_out=cycle.split == "held_out",
-        fuel_kg=fuel_kg,
-        fuel_gal=gallons(fuel_kg),
-        efficiency=work_j / fuel_j if fuel_j > 0 else None,
         soc_initial=float(trajectory.soc[0]),
-        soc_final=trajectory.soc_final,
         soc_target=soc_target,
-        engine_starts=int(np.count_nonzero(trajectory.engine_on & ~before)),
-        shortfall_j=float(trajectory.shortfall_j.sum()),
-        dissipated_j=float(trajectory.dissipated_j.sum()),
         violations=count_violations(trajectory, params),
         dp_ratio=dp_ratio,
-        steps=len(trajectory),
-        trajectory_hash=trajectory_hash(trajectory),
         transport=transport,
+        **run_figures(trajectory, params),
     )
 
 

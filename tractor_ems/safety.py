@@ -5,6 +5,8 @@ The plant checks again on its side; neither trusts the other.
 
 import math
 
+import numpy as np
+
 from tractor_ems.policies.protocol import limits_of
 from tractor_msgs_py.observation import Observation
 from tractor_msgs_py.types import BatteryPowerCommand, CommandMode
@@ -14,26 +16,30 @@ TOLERANCE_W = 1e-3
 """A command moved by less than this counts as untouched [W]."""
 
 
-def safe_command(observation: Observation, command: Command) -> tuple[BatteryPowerCommand, bool]:
-    """The policy's command for the first of the batch, projected on the published limits.
+def safe(observation: Observation, command: Command) -> Command:
+    """The commands of a batch, projected on the published limits.
 
     Battery power that is not finite becomes the fallback law's, engine power that is infinite
     becomes "no opinion".
+    """
+    lb, ub = feasible_battery_power_w(limits_of(observation), observation.power_demand_w)
+    engine_w = command.engine_power_w
+    return Command(
+        project(command.battery_power_w, lb, ub), np.where(np.isinf(engine_w), np.nan, engine_w)
+    )
+
+
+def safe_command(observation: Observation, command: Command) -> tuple[BatteryPowerCommand, bool]:
+    """The policy's command for a batch of one, made safe.
 
     Returns:
         The nominal command, and whether it had to be corrected.
     """
-    asked_w = float(command.battery_power_w[0])
-    engine_w = float(command.engine_power_w[0])
-    lb, ub = feasible_battery_power_w(limits_of(observation), observation.power_demand_w)
-    battery_w = float(project(command.battery_power_w[:1], lb[:1], ub[:1])[0])
-    corrected = math.isinf(engine_w) or not abs(battery_w - asked_w) <= TOLERANCE_W
-    return (
-        BatteryPowerCommand(
-            observation.stamp_ns, battery_w, math.nan if math.isinf(engine_w) else engine_w
-        ),
-        corrected,
-    )
+    made = safe(observation, command)
+    battery_w, engine_w = float(made.battery_power_w[0]), float(made.engine_power_w[0])
+    moved_w = abs(battery_w - float(command.battery_power_w[0]))
+    corrected = math.isinf(command.engine_power_w[0]) or not moved_w <= TOLERANCE_W
+    return BatteryPowerCommand(observation.stamp_ns, battery_w, engine_w), corrected
 
 
 def fallback_command(observation: Observation, mode: CommandMode) -> BatteryPowerCommand:

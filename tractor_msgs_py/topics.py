@@ -1,7 +1,7 @@
 """What flows between the nodes: topic names, message types and QoS, in one table.
 
 Names are relative, so the namespace is the user's (``-r __ns:=/tractor1``). Nothing here imports
-ROS; ``tractor_msgs_py.ros.qos`` turns a :class:`Qos` into an rclpy profile.
+ROS; ``tractor_msgs_py.ros.shell`` turns a :class:`Qos` into an rclpy profile.
 """
 
 from dataclasses import dataclass

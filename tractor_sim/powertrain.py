@@ -28,7 +28,7 @@ from tractor_sim.engine import EngineParams
 from tractor_sim.generator import GeneratorParams
 
 ROUNDING_W = 1e-6
-"""A bus imbalance below this is rounding, not shortfall."""
+"""A bus imbalance below this is rounding: neither shortfall nor a reason to start the engine."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ def step(
     engine_wanted_w = power_demand_w - project(wanted_w, lb, ub)
 
     can_run = limits.engine_w > 0.0
-    off = (limits.may_be_off & (engine_wanted_w <= 0.0)) | ~can_run
+    off = (limits.may_be_off & (engine_wanted_w <= ROUNDING_W)) | ~can_run
     engine_w = np.where(
         off, 0.0, np.minimum(np.maximum(engine_wanted_w, limits.engine_least_w), limits.engine_w)
     )

@@ -16,8 +16,7 @@ import numpy as np
 from tractor_msgs_py.atomic import write_bytes, write_json
 from tractor_msgs_py.errors import RunAborted
 from tractor_msgs_py.trajectory import Trajectory, trajectory_hash
-from tractor_sim.fuel import gallons
-from tractor_sim.generator import to_crank_w
+from tractor_sim.figures import run_figures
 from tractor_sim.plant_run import PlantRun
 
 COLUMNS = tuple(field.name for field in fields(Trajectory) if field.name != "soc_final")
@@ -26,11 +25,6 @@ _TYPES: dict[str, Any] = {"stamp_ns": np.int64, "engine_on": np.bool_}
 
 def summary(run: PlantRun, counters: dict[str, int]) -> dict[str, Any]:
     """A finished run in numbers, as plain JSON data; efficiency is null when no fuel was burnt."""
-    trajectory, engine = run.trajectory(), run.params.engine
-    fuel_kg = float(trajectory.fuel_kg.sum())
-    crank_w = to_crank_w(run.params.generator, trajectory.engine_power_w, engine.power_max_w)
-    work_j = float(crank_w.sum()) * run.params.dt_s
-    before = np.concatenate(([False], trajectory.engine_on[:-1]))
     return {
         "run_id": run.info.run_id,
         "cycle": run.info.cycle,
@@ -38,17 +32,9 @@ def summary(run: PlantRun, counters: dict[str, int]) -> dict[str, Any]:
         "powertrain": run.info.powertrain,
         "powertrain_hash": run.info.powertrain_hash,
         "lockstep": run.info.lockstep,
-        "steps": len(trajectory),
-        "fuel_kg": fuel_kg,
-        "fuel_gal": gallons(fuel_kg),
-        "efficiency": work_j / (fuel_kg * engine.fuel_lhv_j_per_kg) if fuel_kg > 0 else None,
         "soc_initial": run.info.soc_initial,
-        "soc_final": trajectory.soc_final,
         "soc_target": run.info.soc_target,
-        "engine_starts": int(np.count_nonzero(trajectory.engine_on & ~before)),
-        "shortfall_j": float(trajectory.shortfall_j.sum()),
-        "dissipated_j": float(trajectory.dissipated_j.sum()),
-        "trajectory_hash": trajectory_hash(trajectory),
+        **run_figures(run.trajectory(), run.params),
         "counters": counters,
         "package_version": run.info.package_version,
         "command_line": run.info.command_line,

@@ -192,3 +192,13 @@ def test_minimum_times_and_ramp_are_kept():
     assert on == [True, True, True, True], "off is refused for the first 5 s"
     assert np.all(np.abs(np.diff([0.0, *powers_w])) <= 60e3)
     assert powers_w[1] > powers_w[0]
+
+
+@settings(max_examples=200, deadline=None)
+@given(soc=st.floats(0.70, 0.7003), scale=st.floats(0.5, 1.0))
+def test_rounding_does_not_start_the_engine(soc, scale):
+    state = plant(soc)
+    demand_w = power_limits(PAPER, state).discharge_w * scale
+    after, result = step(PAPER, state, demand_w, Command(demand_w, np.full(1, np.nan)))
+    assert not after.engine_on[0]
+    assert result.fuel_kg[0] == 0.0
