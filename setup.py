@@ -124,6 +124,7 @@ setup(
             "psutil>=5.9",
             "pytest>=8",
             "pytest-timeout>=2.3",
+            "pytest-xdist>=3.5",
             "ros-jazzy-domain-coordinator",
             "ruff>=0.6",
             "types-PyYAML",

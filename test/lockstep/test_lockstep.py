@@ -173,4 +173,6 @@ def test_an_answer_that_is_not_finite_is_driven_as_in_process(make_run):
     while not lockstep.done:
         lockstep.offer(answer(lockstep, math.nan), 1, 0.1)
     expected = drive(Broken(), run.params, run.power_demand_w[None], 0.85, 0.85)[0]
-    assert trajectory_hash(run.trajectory()) == trajectory_hash(expected)
+    driven = run.trajectory()  # the command differs: a node would have made it safe
+    for column in ("battery_power_w", "engine_power_w", "fuel_kg", "soc", "engine_on"):
+        np.testing.assert_array_equal(getattr(driven, column), getattr(expected, column))
