@@ -13,7 +13,7 @@ endif
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test test-slow lint format shipped-policy golden-bags clean
+.PHONY: help venv demo test test-slow lint format shipped-policy clean
 
 help:
 	@echo 'make demo       record experts, learn from their bags, drive the plant: out/demo'
@@ -22,7 +22,6 @@ help:
 	@echo 'make lint       ruff and mypy'
 	@echo 'make format     let ruff format the code'
 	@echo 'make shipped-policy  train the policy that ships, tractor_sim/data/policy'
-	@echo 'make golden-bags     record bags/ anew through the nodes'
 	@echo 'make venv       build .venv only (EXTRAS=$(EXTRAS))'
 	@echo 'make clean      remove .venv, builds, caches and out/demo'
 

@@ -14,7 +14,7 @@ from tractor_ems.learning.train import train
 from tractor_ems.plots import plot_runs
 from tractor_ems.result import Result
 from tractor_ems.scenario import Scenario, make_scenario
-from tractor_msgs_py.atomic import write_json
+from tractor_msgs_py.atomic import write_bytes, write_json
 from tractor_msgs_py.errors import ConfigError
 from tractor_msgs_py.trajectory import Trajectory
 from tractor_sim.duty_cycle.library import cycle_names
@@ -22,6 +22,8 @@ from tractor_sim.duty_cycle.library import cycle_names
 SUMMARY_SCHEMA = 1
 BASELINES = ("dp", "rule_based", "best_point", "myopic_greedy", "conventional")
 MADE_HERE = ("bags", "policies", "plots", "summary.json")
+MARKER = ".tractor_ems_demo"
+"""File that says a folder is a demo's; only such a folder is cleared."""
 
 Say = Callable[[str], None]
 
@@ -56,7 +58,7 @@ def run_demo(out: Path, config: DemoConfig, say: Say) -> dict[str, Any]:
         say: receives one line per finished piece of work.
 
     Raises:
-        ConfigError: ``out`` holds something that is not a demo's.
+        ConfigError: ``out`` holds something and no demo made it.
         TractorEmsError: a run was aborted.
     """
     _clear(out)
@@ -90,14 +92,13 @@ def _scenario(config: DemoConfig, cycle: str) -> Scenario:
 
 
 def _clear(out: Path) -> None:
-    if out.exists():
-        foreign = sorted(item.name for item in out.iterdir() if item.name not in MADE_HERE)
-        if foreign:
-            raise ConfigError(f"{out}: holds {foreign[0]!r}, which no demo made; choose another")
-        for name in MADE_HERE:
-            path = out / name
-            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
-    out.mkdir(parents=True, exist_ok=True)
+    ours = (out / MARKER).is_file()
+    if out.exists() and not ours and (not out.is_dir() or any(out.iterdir())):
+        raise ConfigError(f"{out}: exists and no demo made it; choose another folder")
+    write_bytes(out / MARKER, b"made by ems demo, which replaces what it made\n")
+    for name in MADE_HERE:
+        path = out / name
+        shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 def _record(out: Path, config: DemoConfig, tell: Say) -> list[dict[str, Any]]:

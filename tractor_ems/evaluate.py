@@ -4,9 +4,11 @@ from pathlib import Path
 
 from tractor_ems.drive import drive
 from tractor_ems.optimal.score import dp_ratio
+from tractor_ems.policies.protocol import Policy
 from tractor_ems.policies.registry import make_policy, node_of
 from tractor_ems.result import Result, Transport, summarise
 from tractor_ems.scenario import Scenario
+from tractor_msgs_py.errors import TractorEmsError
 from tractor_msgs_py.trajectory import Trajectory
 
 
@@ -35,15 +37,11 @@ def evaluate(
         from tractor_ems.ros_run import run_ros
 
         # The node solves its own cycle; anything else is made here too, to refuse it early.
-        name = policy
-        if policy != "dp":
-            name = make_policy(
-                policy, scenario, allow_other_powertrain=allow_other_powertrain
-            ).name
+        made = None if policy == "dp" else _make(policy, scenario, allow_other_powertrain)
         node = node_of(policy, scenario, allow_other_powertrain=allow_other_powertrain)
         trajectory = run_ros(node, scenario, record=record).trajectory
-        return score(name, scenario, trajectory, transport), trajectory
-    made = make_policy(policy, scenario, allow_other_powertrain=allow_other_powertrain)
+        return score(made or policy, scenario, trajectory, transport), trajectory
+    made = _make(policy, scenario, allow_other_powertrain)
     if record is not None:
         from tractor_ems.bags.in_process import record_in_process
 
@@ -56,25 +54,43 @@ def evaluate(
             scenario.soc_initial,
             scenario.soc_target,
         )[0]
-    return score(made.name, scenario, trajectory, transport), trajectory
+    return score(made, scenario, trajectory, transport), trajectory
 
 
-def score(policy: str, scenario: Scenario, trajectory: Trajectory, transport: Transport) -> Result:
-    """The result row of a finished run, with its matched-SOC DP ratio."""
-    ratio = dp_ratio(
-        scenario.params,
-        trajectory.power_demand_w,
-        float(trajectory.soc[0]),
-        trajectory.soc_final,
-        float(trajectory.fuel_kg.sum()),
-        shortfall_j=float(trajectory.shortfall_j.sum()),
-    )
+def score(
+    policy: Policy | str, scenario: Scenario, trajectory: Trajectory, transport: Transport
+) -> Result:
+    """The result row of a finished run, with its matched-SOC DP ratio.
+
+    A run that was driven is reported even where DP cannot judge it; ``dp_note`` says why.
+    """
+    shortfall_j = float(trajectory.shortfall_j.sum())
+    ratio, note = None, None
+    try:
+        ratio = dp_ratio(
+            scenario.params,
+            trajectory.power_demand_w,
+            float(trajectory.soc[0]),
+            trajectory.soc_final,
+            float(trajectory.fuel_kg.sum()),
+            shortfall_j=shortfall_j,
+        )
+        if shortfall_j > 0.0:
+            note = f"shortfall of {shortfall_j:.0f} J: undelivered work does not score"
+    except TractorEmsError as error:
+        note = str(error)
     return summarise(
         trajectory,
-        policy=policy,
+        policy=policy if isinstance(policy, str) else policy.name,
         cycle=scenario.cycle,
         params=scenario.params,
         soc_target=scenario.soc_target,
         transport=transport,
         dp_ratio=ratio,
+        dp_note=note,
+        trained_on=getattr(policy, "metadata", {}).get("cycle_hashes", ()),
     )
+
+
+def _make(policy: str, scenario: Scenario, allow_other_powertrain: bool) -> Policy:
+    return make_policy(policy, scenario, allow_other_powertrain=allow_other_powertrain)

@@ -1,12 +1,13 @@
 """One run as one row: what it burnt, where it ended, what it broke, how close to DP it came."""
 
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
 
 from tractor_msgs_py.trajectory import Trajectory
-from tractor_sim.duty_cycle.cycle import DutyCycle
+from tractor_sim.duty_cycle.cycle import DutyCycle, cycle_hash
 from tractor_sim.figures import run_figures
 from tractor_sim.powertrain import PowertrainParams
 
@@ -22,13 +23,14 @@ class Result:
 
     Attributes:
         policy, cycle, powertrain: names.
-        held_out: the cycle is one that training must never see.
+        held_out: the cycle is one that training must never see, and this policy's did not.
         fuel_kg, fuel_gal: fuel burnt, start fuel included.
         efficiency: crankshaft work over fuel energy; None when nothing was burnt.
         soc_initial, soc_final, soc_target: fractions.
         engine_starts: number of engine starts.
         shortfall_j, dissipated_j: undelivered demand, braked-away energy [J].
         violations: steps that broke a SOC or power limit or the bus balance; 0 or a bug.
+        dp_note: why there is no dp_ratio, or None.
         dp_ratio: fuel of DP to the run's own final SOC over the run's fuel, at most 1 up to grid
             error; None where there was shortfall, because undelivered work must not score.
         steps: steps driven.
@@ -51,6 +53,7 @@ class Result:
     dissipated_j: float
     violations: int
     dp_ratio: float | None
+    dp_note: str | None
     steps: int
     trajectory_hash: str
     transport: Transport
@@ -69,17 +72,23 @@ def summarise(
     soc_target: float,
     transport: Transport,
     dp_ratio: float | None,
+    dp_note: str | None = None,
+    trained_on: Collection[str] = (),
 ) -> Result:
-    """The row of one run, computed from its trajectory alone."""
+    """The row of one run, computed from its trajectory alone.
+
+    ``trained_on`` holds the hashes of the cycles that the policy learnt from.
+    """
     return Result(
         policy=policy,
         cycle=cycle.name,
         powertrain=params.name,
-        held_out=cycle.split == "held_out",
+        held_out=cycle.split == "held_out" and cycle_hash(cycle) not in trained_on,
         soc_initial=float(trajectory.soc[0]),
         soc_target=soc_target,
         violations=count_violations(trajectory, params),
         dp_ratio=dp_ratio,
+        dp_note=dp_note,
         transport=transport,
         **run_figures(trajectory, params),
     )

@@ -10,6 +10,7 @@ from tractor_msgs_py.trajectory import FloatArray
 from tractor_sim.config import load_powertrain
 from tractor_sim.duty_cycle.cycle import DutyCycle
 from tractor_sim.duty_cycle.library import load_cycle
+from tractor_sim.duty_cycle.shipped import with_shipped_split
 from tractor_sim.powertrain import PowertrainParams
 
 
@@ -70,10 +71,13 @@ def make_scenario(
 
 
 def resolve_cycle(text: str) -> DutyCycle:
-    """A cycle by shipped name, CSV file, or bag (its power demand less the auxiliaries)."""
+    """A cycle by shipped name, CSV file, or bag (its power demand less the auxiliaries).
+
+    A file that holds a shipped cycle's demand is in that cycle's split.
+    """
     path = Path(text)
     if path.is_dir() or path.suffix == ".mcap":
         from tractor_ems.bags.transitions import cycle_of_bag
 
-        return cycle_of_bag(path)
-    return load_cycle(text)
+        return with_shipped_split(cycle_of_bag(path))
+    return with_shipped_split(load_cycle(text))

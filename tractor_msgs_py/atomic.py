@@ -1,5 +1,6 @@
 """Files that are either whole or absent: write beside, fsync, replace."""
 
+import contextlib
 import json
 import os
 from collections.abc import Callable
@@ -27,7 +28,8 @@ def write_bytes_with(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from None
     finally:
-        beside.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # it may never have been there
+            beside.unlink()
 
 
 def write_bytes(path: Path, data: bytes) -> None:

@@ -83,5 +83,13 @@ def test_its_bags_pass_every_check_and_its_training_names_them(demo):
 def test_a_folder_that_no_demo_made_is_left_alone(tmp_path, capsys):
     (tmp_path / "thesis.tex").write_text("years of work")
     assert main(["demo", "--out", str(tmp_path)]) == 2
-    assert "thesis.tex" in capsys.readouterr().err
+    assert str(tmp_path) in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_folder_that_only_looks_like_a_demos_is_left_alone(tmp_path):
+    mine = tmp_path / "bags" / "mine.mcap"
+    mine.parent.mkdir()
+    mine.write_bytes(b"a season")
+    assert main(["demo", "--out", str(tmp_path)]) == 2
+    assert mine.read_bytes() == b"a season"

@@ -75,6 +75,16 @@ def test_dp_ends_where_it_is_told_and_certifies(capsys):
     assert certificate["soc_points"] >= 401
 
 
+def test_a_held_out_cycle_in_a_file_is_still_held_out(capsys, tmp_path):
+    path = tmp_path / "mine.csv"
+    demand_w = load_cycle("planter_1001").power_demand_w.tolist()
+    rows = "\n".join(f"{k},{power!r}" for k, power in enumerate(demand_w))
+    path.write_text(f"time_s,power_demand_w\n{rows}\n")
+    assert document(capsys, "evaluate", "--policy", "conventional", "--cycle", str(path))[
+        "held_out"
+    ]
+
+
 def test_a_csv_cycle_is_driven_and_shortfall_scores_null(capsys, tmp_path):
     path = tmp_path / "field.csv"
     rows = "\n".join(f"{k},{power}" for k, power in enumerate([50e3, 600e3, 80e3]))
@@ -108,6 +118,10 @@ def test_cycles_are_listed_and_shown(capsys):
         (["evaluate", "--policy", "dp", "--transport", "tcp"], "tcp"),
         (["evaluate", "--policy", "dp", "--soc0", "high"], "--soc0"),
         (["dp", "--soc-final", "0.2"], "0.2"),
+        (
+            ["dp", "--cycle", "short.csv", "--soc0", "0.85", "--soc-final", "0.8"],
+            "cannot be reached",
+        ),
         (["dp", "--soc-fnal", "0.8"], "--soc-fnal"),
         (["bag", "check", "nowhere"], "nowhere"),
         (["bag", "info", "nowhere"], "nowhere"),
@@ -119,5 +133,6 @@ def test_cycles_are_listed_and_shown(capsys):
 )
 def test_bad_input_is_one_line_and_exit_code_2(capsys, tmp_path, monkeypatch, argv, named):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "short.csv").write_text("time_s,power_demand_w\n0,1e5\n1,1e5\n2,1e5\n")
     assert named in refusal(capsys, *argv)
-    assert list(tmp_path.iterdir()) == [], "nothing half-written"
+    assert [path.name for path in tmp_path.iterdir()] == ["short.csv"], "nothing half-written"

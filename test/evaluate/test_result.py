@@ -6,12 +6,16 @@ import numpy as np
 import pytest
 
 from tractor_ems.drive import drive
+from tractor_ems.evaluate import evaluate
 from tractor_ems.policies.rules import BestPoint, Conventional, MyopicGreedy, RuleBased
 from tractor_ems.result import count_violations, summarise
+from tractor_ems.scenario import make_scenario
 from tractor_msgs_py.trajectory import trajectory_hash
 from tractor_sim.config import load_powertrain
+from tractor_sim.duty_cycle.cycle import cycle_hash
 from tractor_sim.duty_cycle.library import load_cycle
 from tractor_sim.fuel import gallons
+from tractor_sim.resources import resource_path
 
 PAPER = load_powertrain("paper")
 PLANTER = load_cycle("planter")
@@ -49,6 +53,30 @@ def test_a_row_adds_up():
 def test_a_held_out_cycle_is_marked():
     cycle = load_cycle("planter_1001")
     assert row(driven(Conventional(), cycle), cycle).held_out
+
+
+def test_a_cycle_that_the_policy_was_trained_on_is_not_held_out_for_it():
+    cycle = load_cycle("planter_1001")
+    result = summarise(
+        driven(Conventional(), cycle),
+        policy="p",
+        cycle=cycle,
+        params=PAPER,
+        soc_target=0.836,
+        transport="in_process",
+        dp_ratio=None,
+        trained_on=[cycle_hash(cycle)],
+    )
+    assert not result.held_out
+
+
+def test_a_run_that_dp_cannot_judge_is_reported_with_the_reason(tmp_path):
+    text = resource_path("config", "powertrain", "paper.yaml").read_text()
+    path = tmp_path / "start.yaml"
+    path.write_text(text.replace("engine:\n", "engine:\n  start_fuel_kg: 0.015\n"))
+    result, _ = evaluate("rule_based", make_scenario(str(path), "planter_1"))
+    assert result.dp_ratio is None
+    assert "start_fuel_kg" in result.dp_note
 
 
 @pytest.mark.parametrize(

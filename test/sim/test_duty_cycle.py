@@ -58,6 +58,11 @@ def test_a_csv_cycle_is_read(tmp_path):
     assert cycle.power_demand_w.tolist() == [1000.0, -2000.0, 3000.0]
 
 
+def test_times_since_1970_are_even_enough(tmp_path):
+    rows = "\n".join(f"{1_700_000_000 + k / 10:.1f},{1000 * k}" for k in range(300))
+    assert read_cycle_csv(write(tmp_path, f"time_s,power_demand_w\n{rows}\n")).dt_s == 0.1
+
+
 @pytest.mark.parametrize(
     ("text", "named"),
     [

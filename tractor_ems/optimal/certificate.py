@@ -88,7 +88,7 @@ def certify(
     Raises:
         ConfigError: a SOC is outside the window, or soc_final cannot be reached on this cycle.
     """
-    start, end = _checked_soc(params, power_demand_w, soc_initial, soc_final)
+    start, end = checked_soc(params, power_demand_w, soc_initial, soc_final)
     coarse = solve(
         params, power_demand_w, end, soc_initial=start, soc_points=soc_points, actions=actions
     )
@@ -143,9 +143,14 @@ def _priced(
     return fuel_kg, residual_kg, fuel_kg + shortfall_kg
 
 
-def _checked_soc(
+def checked_soc(
     params: PowertrainParams, power_demand_w: FloatArray, soc_initial: float, soc_final: float
 ) -> tuple[float, float]:
+    """Both SOC with float32 rounding forgiven.
+
+    Raises:
+        ConfigError: one is outside the window, or soc_final cannot be reached on this cycle.
+    """
     battery = params.battery
     clipped = np.clip([soc_initial, soc_final], battery.soc_min, battery.soc_max)
     for name, given, inside in zip(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tractor_ems.learning.rewards import best_specific_fuel_kg_per_j
 from tractor_ems.policies.protocol import ANY_RUN, limits_of
 from tractor_msgs_py.observation import Observation, ObservationSpec
 from tractor_msgs_py.trajectory import BoolArray, FloatArray
@@ -134,7 +135,7 @@ class MyopicGreedy:
         """Search the action grid, clipped to the feasible set."""
         params = self.powertrain
         engine, generator = params.engine, params.generator
-        price_kg_per_j = 1.0 / (max(engine.curve_efficiency) * engine.fuel_lhv_j_per_kg)
+        price_kg_per_j = best_specific_fuel_kg_per_j(params)
         demand_w = observation.power_demand_w
         lb, ub = feasible_battery_power_w(limits_of(observation), demand_w)
         grid_w = battery_power_grid_w(params, self.actions)

@@ -88,9 +88,22 @@ def read_cycle_csv(path: Path) -> DutyCycle:
                     f"{path}:{number}: {name} is {row[name]!r}, not a number"
                 ) from None
         columns[name] = np.array(values)
-    steps_s = np.diff(columns["time_s"])
-    if not np.all(np.isfinite(steps_s)) or steps_s[0] <= 0 or np.ptp(steps_s) > 1e-6 * steps_s[0]:
+    dt_s = _equal_step_s(columns["time_s"])
+    if dt_s is None:
         raise CycleError(f"{path}: time_s must advance by equal steps > 0")
-    return DutyCycle(
-        path.stem, columns["power_demand_w"], float(steps_s[0]), "csv", source=str(path)
-    )
+    return DutyCycle(path.stem, columns["power_demand_w"], dt_s, "csv", source=str(path))
+
+
+def _equal_step_s(time_s: FloatArray) -> float | None:
+    """The step of an even time axis to the microsecond, or None.
+
+    Times since 1970 resolve 0.2 us as float64, so evenness is judged no finer than that.
+    """
+    if not np.all(np.isfinite(time_s)):
+        return None
+    dt_s = float(time_s[-1] - time_s[0]) / (len(time_s) - 1)
+    even = time_s[0] + dt_s * np.arange(len(time_s))
+    tolerance_s = max(1e-6 * dt_s, 4 * float(np.spacing(np.abs(time_s).max())))
+    if dt_s <= 0 or np.any(np.abs(time_s - even) > tolerance_s):
+        return None
+    return round(dt_s, 6)
