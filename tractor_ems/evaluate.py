@@ -19,6 +19,7 @@ def evaluate(
     transport: Transport = "in_process",
     record: Path | None = None,
     allow_other_powertrain: bool = False,
+    soc_guard: bool = True,
 ) -> tuple[Result, Trajectory]:
     """Drive and score.
 
@@ -29,19 +30,21 @@ def evaluate(
             trajectory hash is the same.
         record: folder of a new bag that receives the run; None records nothing.
         allow_other_powertrain: let a learned policy drive a powertrain it was not made for.
+        soc_guard: of the rule base.
 
     Raises:
         TractorEmsError: bad input, or a run that was aborted.
     """
+    options = {"allow_other_powertrain": allow_other_powertrain, "soc_guard": soc_guard}
     if transport == "ros":
         from tractor_ems.ros_run import run_ros
 
         # The node solves its own cycle; anything else is made here too, to refuse it early.
-        made = None if policy == "dp" else _make(policy, scenario, allow_other_powertrain)
-        node = node_of(policy, scenario, allow_other_powertrain=allow_other_powertrain)
+        made = None if policy == "dp" else make_policy(policy, scenario, **options)
+        node = node_of(policy, scenario, **options)
         trajectory = run_ros(node, scenario, record=record).trajectory
         return score(made or policy, scenario, trajectory, transport), trajectory
-    made = _make(policy, scenario, allow_other_powertrain)
+    made = make_policy(policy, scenario, **options)
     if record is not None:
         from tractor_ems.bags.in_process import record_in_process
 
@@ -90,7 +93,3 @@ def score(
         dp_note=note,
         trained_on=getattr(policy, "metadata", {}).get("cycle_hashes", ()),
     )
-
-
-def _make(policy: str, scenario: Scenario, allow_other_powertrain: bool) -> Policy:
-    return make_policy(policy, scenario, allow_other_powertrain=allow_other_powertrain)

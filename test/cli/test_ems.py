@@ -57,6 +57,13 @@ def test_evaluate_prints_one_bare_result(capsys, policy):
     assert result["dp_ratio"] <= 1.0005
 
 
+def test_the_rule_bases_soc_guard_can_be_switched_off(capsys):
+    drive = ("evaluate", "--policy", "rule_based", "--soc0", "0.703", "--cycle", "planter")
+    guarded, bare = document(capsys, *drive), document(capsys, *drive, "--no-soc-guard")
+    assert guarded["trajectory_hash"] != bare["trajectory_hash"]
+    assert guarded["soc_final"] > bare["soc_final"]
+
+
 def test_the_default_policy_ships_and_drives(capsys):
     result = document(capsys, "evaluate", "--cycle", "planter_1001", "--soc-target", "0.836")
     assert result["policy"] == "ddqn_counterfactual"

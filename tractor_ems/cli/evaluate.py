@@ -35,6 +35,7 @@ def evaluate(
     allow_other_powertrain: Annotated[
         bool, typer.Option(help="Drive a powertrain the policy was not made for.")
     ] = False,
+    soc_guard: Annotated[bool, typer.Option(help="SOC guard of rule_based.")] = True,
     json: JsonFlag = False,
 ) -> None:
     """Drive one policy over one cycle and score it against DP to the run's own final SOC."""
@@ -51,6 +52,7 @@ def evaluate(
         transport=kinds[transport],
         record=record,
         allow_other_powertrain=allow_other_powertrain,
+        soc_guard=soc_guard,
     )
     if plot is not None:
         from tractor_ems.plots import plot_runs

@@ -31,8 +31,20 @@ def policy_file(name: str, powertrain: str) -> Path:
     return Path(name)
 
 
-def make_policy(name: str, scenario: Scenario, *, allow_other_powertrain: bool = False) -> Policy:
+def make_policy(
+    name: str,
+    scenario: Scenario,
+    *,
+    allow_other_powertrain: bool = False,
+    soc_guard: bool = True,
+) -> Policy:
     """A policy ready to drive ``scenario``.
+
+    Args:
+        name: one of :data:`NAMES`, or a policy file.
+        scenario: what it will drive.
+        allow_other_powertrain: let a learned policy drive a powertrain it was not made for.
+        soc_guard: of the rule base.
 
     Raises:
         PolicyError: unknown name, unreadable file, or a file made for another powertrain.
@@ -41,7 +53,7 @@ def make_policy(name: str, scenario: Scenario, *, allow_other_powertrain: bool =
     if name == "conventional":
         return Conventional()
     if name == "rule_based":
-        return RuleBased(params)
+        return RuleBased(params, soc_guard=soc_guard)
     if name == "best_point":
         return BestPoint(params)
     if name == "myopic_greedy":
@@ -61,13 +73,21 @@ def make_policy(name: str, scenario: Scenario, *, allow_other_powertrain: bool =
 
 
 def node_of(
-    policy: str, scenario: Scenario, *, allow_other_powertrain: bool = False
+    policy: str,
+    scenario: Scenario,
+    *,
+    allow_other_powertrain: bool = False,
+    soc_guard: bool = True,
 ) -> tuple[str, dict[str, object]]:
-    """Node executable and its parameters for a policy named by the user."""
+    """Node executable and its parameters: the same choice as :func:`make_policy`."""
     if policy == "dp":
         return "dp_policy", {}
     if policy in RULES:
-        return "rule_based_policy", {"policy": policy, "powertrain": scenario.powertrain_source}
+        return "rule_based_policy", {
+            "policy": policy,
+            "powertrain": scenario.powertrain_source,
+            "soc_guard": soc_guard,
+        }
     return "ddqn_policy", {
         "policy_file": str(policy_file(policy, scenario.params.name).resolve()),
         "allow_other_powertrain": allow_other_powertrain,
