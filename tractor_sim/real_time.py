@@ -5,10 +5,9 @@ power, projected on the feasible set. A dead or doubled policy never stops the p
 """
 
 import math
-from collections import Counter
 
 from tractor_msgs_py.types import BatteryPowerCommand, CommandMode, Sample
-from tractor_sim.lockstep import Peers, StartGate, named
+from tractor_sim.pace import Pace
 from tractor_sim.plant_run import PlantRun
 
 
@@ -23,7 +22,7 @@ def held_command(
     return BatteryPowerCommand(stamp_ns, demand_now_w - set_point_w, command.engine_power_w)
 
 
-class RealTime:
+class RealTime(Pace):
     """The plant's side in real time.
 
     A step over [t_k, t_k+1) is taken when it is over. A command's age is the wall time since the
@@ -32,8 +31,6 @@ class RealTime:
     until the middleware's lease ends, about 20 s.
 
     Attributes:
-        gate: holds the start.
-        refusals: commands by what was wrong with them.
         fallback_ticks: steps driven by the fallback law.
     """
 
@@ -44,36 +41,18 @@ class RealTime:
         command_timeout_s: float,
         match_timeout_s: float = 0.0,
     ) -> None:
-        self.run = run
-        self.refusals: Counter[str] = Counter()
+        super().__init__(run, match_timeout_s)
         self.fallback_ticks = 0
-        self.started = False
-        self.gate = StartGate(run.info.expected_recorders, match_timeout_s)
         self._period_s = period_s
         self._timeout_s = command_timeout_s
         self._due_s = 0.0
         self._published_s: dict[int, float] = {}
         self._newest: BatteryPowerCommand | None = None
 
-    @property
-    def done(self) -> bool:
-        """True after the last step."""
-        return self.run.done
+    def _own_counters(self) -> dict[str, int]:
+        return {"fallback_ticks": self.fallback_ticks}
 
-    @property
-    def counters(self) -> dict[str, int]:
-        """What people want to see: fallback steps and refusals by reason."""
-        return {"fallback_ticks": self.fallback_ticks, **named(self.refusals)}
-
-    def start(self, peers: Peers, now_s: float) -> tuple[Sample, ...]:
-        """The first tick once everyone is connected, nothing before.
-
-        Raises:
-            RunAborted: nobody came within the timeout, or more than one policy did.
-        """
-        if not self.gate.open(peers, now_s):
-            return ()
-        self.started = True
+    def _first_tick(self, now_s: float) -> tuple[Sample, ...]:
         self._due_s = now_s
         return self._publish(now_s)
 

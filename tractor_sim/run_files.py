@@ -7,6 +7,7 @@ was read equals the one that was written.
 import csv
 import io
 import json
+import tempfile
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,12 @@ from typing import Any
 import numpy as np
 
 from tractor_msgs_py.atomic import write_bytes, write_json
-from tractor_msgs_py.errors import RunAborted
+from tractor_msgs_py.errors import ConfigError, RunAborted
 from tractor_msgs_py.trajectory import Trajectory, trajectory_hash
 from tractor_sim.figures import run_figures
 from tractor_sim.plant_run import PlantRun
 
+TABLE, RESULT = "trajectory.csv", "result.json"
 COLUMNS = tuple(field.name for field in fields(Trajectory) if field.name != "soc_final")
 _TYPES: dict[str, Any] = {"stamp_ns": np.int64, "engine_on": np.bool_}
 
@@ -54,18 +56,37 @@ def line_of(result: dict[str, Any]) -> str:
     )
 
 
+def clear_run(folder: Path) -> None:
+    """Make ``folder`` ready for a result: it exists, can be written to and holds no old result.
+
+    Raises:
+        ConfigError: it cannot be made so.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in (RESULT, TABLE):  # the result first: its presence says "done"
+            (folder / name).unlink(missing_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise ConfigError(f"{folder}: no place for a result ({error.strerror or error})") from None
+
+
 def write_run(folder: Path, trajectory: Trajectory, result: dict[str, Any]) -> None:
     """Write both files into ``folder``, each whole or not at all.
 
     Raises:
-        ConfigError: the folder cannot be written to.
+        RunAborted: the folder cannot be written to (any more).
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
     writer.writerows(zip(*(getattr(trajectory, name).tolist() for name in COLUMNS), strict=True))
-    write_bytes(folder / "trajectory.csv", text.getvalue().encode())
-    write_json(folder / "result.json", result)
+    try:
+        write_bytes(folder / TABLE, text.getvalue().encode())
+        write_json(folder / RESULT, result)
+    except ConfigError as error:
+        raise RunAborted(str(error)) from None
 
 
 def read_run(folder: Path) -> tuple[Trajectory, dict[str, Any]]:
@@ -75,8 +96,8 @@ def read_run(folder: Path) -> tuple[Trajectory, dict[str, Any]]:
         RunAborted: the run left no result, or one whose hash is not that of its trajectory.
     """
     try:
-        result = json.loads((folder / "result.json").read_text(encoding="utf-8"))
-        with (folder / "trajectory.csv").open(newline="", encoding="utf-8") as file:
+        result = json.loads((folder / RESULT).read_text(encoding="utf-8"))
+        with (folder / TABLE).open(newline="", encoding="utf-8") as file:
             header, *rows = csv.reader(file)
         if tuple(header) != COLUMNS:
             raise ValueError(f"columns {header}")

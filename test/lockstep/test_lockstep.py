@@ -10,7 +10,8 @@ from tractor_ems.policies.rules import RuleBased
 from tractor_msgs_py.errors import RunAborted
 from tractor_msgs_py.trajectory import trajectory_hash
 from tractor_msgs_py.types import BatteryPowerCommand, CommandMode
-from tractor_sim.lockstep import RESEND_S, Lockstep, Peers
+from tractor_sim.lockstep import RESEND_S, Lockstep
+from tractor_sim.pace import Peers
 from tractor_sim.powertrain import Command
 
 EVERYONE = Peers(command_publishers=1, observation_subscribers=1, run_info_delivered=True)
@@ -138,6 +139,7 @@ def test_late_commands_after_the_last_step_change_nothing(lockstep):
     assert len(final) == 2
     before = trajectory_hash(lockstep.run.trajectory())
     assert lockstep.offer(answer(lockstep), 1, 0.2) == ()
+    assert lockstep.offer(answer(lockstep), 2, 0.3) == (), "a policy that came after the end"
     assert trajectory_hash(lockstep.run.trajectory()) == before
 
 

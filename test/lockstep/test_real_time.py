@@ -5,7 +5,7 @@ import math
 import pytest
 
 from tractor_msgs_py.types import BatteryPowerCommand, CommandMode
-from tractor_sim.lockstep import Peers
+from tractor_sim.pace import Peers
 from tractor_sim.real_time import RealTime, held_command
 
 EVERYONE = Peers(command_publishers=1, observation_subscribers=1, run_info_delivered=True)

@@ -5,10 +5,10 @@ import math
 
 import pytest
 
-from tractor_msgs_py.errors import RunAborted
+from tractor_msgs_py.errors import ConfigError, RunAborted
 from tractor_msgs_py.trajectory import trajectory_hash
 from tractor_msgs_py.types import BatteryPowerCommand
-from tractor_sim.run_files import line_of, read_run, summary, write_run
+from tractor_sim.run_files import clear_run, line_of, read_run, summary, write_run
 
 
 @pytest.fixture
@@ -63,3 +63,25 @@ def test_a_cut_or_altered_trajectory_is_refused(folder):
 def test_a_run_that_never_finished_is_refused(tmp_path):
     with pytest.raises(RunAborted, match="no readable result"):
         read_run(tmp_path)
+
+
+def test_a_new_run_does_not_leave_the_result_of_the_last_one(folder):
+    (folder / "notes.txt").write_text("mine")
+    clear_run(folder)
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+    with pytest.raises(RunAborted, match="no readable result"):
+        read_run(folder)
+
+
+def test_a_folder_that_cannot_take_a_result_is_bad_input_at_the_start(tmp_path):
+    (tmp_path / "file").write_text("")
+    for place in (tmp_path / "file", tmp_path / "file" / "run"):
+        with pytest.raises(ConfigError, match="no place for a result"):
+            clear_run(place)
+
+
+def test_a_folder_lost_during_the_run_aborts_it(finished, folder):
+    (folder / "trajectory.csv").unlink()
+    (folder / "trajectory.csv").mkdir()
+    with pytest.raises(RunAborted, match=r"trajectory.csv: cannot be written"):
+        write_run(folder, finished.trajectory(), summary(finished, {}))

@@ -54,6 +54,13 @@ def test_learned_policy_in_its_node_equals_in_process(graph, cycle, untrained, k
     assert trajectory_hash(trajectory) == in_process_hash(policy)
 
 
+def test_a_run_names_the_command_line_it_was_given_or_else_its_own(graph, cycle, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["/opt/somewhere/plant_sim", "--ros-args"])
+    assert graph.plant(cycle=cycle)._run.info.command_line == "plant_sim --ros-args"
+    given = graph.plant(cycle=cycle, command_line="ems evaluate planter")
+    assert given._run.info.command_line == "ems evaluate planter"
+
+
 def dp_values(cycle) -> dict:
     defaults = {parameter.name: parameter.default for parameter in dp_policy.PARAMETERS}
     return {**defaults, "cycle": cycle, "soc_points": 51, "actions": 101}

@@ -51,7 +51,9 @@ def run(domain_id, monkeypatch, capfd):
         ("rule_based_policy", "policy:=rule_base", "one of rule_based, conventional"),
         ("rule_based_policy", "threshold_w:=-1.0", "range 0..1e+09"),
         ("rule_based_policy", "soc_guard:=1", "parameter soc_guard: 1 is not a valid bool"),
-        ("dp_policy", "soc_points:=1", "range 3..100000"),
+        ("plant_sim", "output:=/dev/null/run", "/dev/null/run: no place for a result"),
+        ("dp_policy", "actions:=100000", "range 2..20000"),
+        ("dp_policy", "soc_points:=1", "range 4..5000"),
         ("dp_policy", "cycle:=planter_0x", "cycle 'planter_0x': unknown"),
         ("ddqn_policy", "policy_file:=none.safetensors", "none.safetensors"),
         ("ddqn_policy", "policy:=none.safetensors", "parameter policy: unknown"),
@@ -62,6 +64,12 @@ def test_a_bad_parameter_stops_the_node_with_one_line_and_code_2(run, name, over
     assert (code, out) == (2, "")
     (line,) = error.splitlines()
     assert line.startswith(f"{name}: ") and said in line
+
+
+def test_a_period_the_plant_cannot_keep_is_refused(run):
+    words = ("-p", "mode:=real_time", "-p", "period_s:=0.001")
+    code, _, error = run("plant_sim", "--ros-args", *words)
+    assert code == 2 and "parameter period_s: 0.001, allowed 0.005..60 or 0" in error
 
 
 @pytest.mark.parametrize(

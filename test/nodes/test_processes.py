@@ -67,7 +67,7 @@ def test_a_policy_killed_mid_run_ends_the_run_with_a_named_reason(
     (line,) = [text for text in plant.output.splitlines() if text.startswith("plant_sim: ")]
     assert "no answer to tick" in line and "the policy died or hangs" in line
     assert "Traceback" not in plant.output
-    assert not (tmp_path / "run").exists()
+    assert not any((tmp_path / "run").iterdir())
 
 
 def test_a_second_policy_ends_the_run_and_both_policies_say_so(start, make_cycle, wait_for):
@@ -89,7 +89,7 @@ def test_a_plant_ends_mid_run_on_a_signal_without_a_result(
     graph.spin_until(lambda: len(observer.heard[topics.BATTERY.name]) > 20, "some ticks")
     assert plant.end(signal.SIGINT) == 0
     assert "Traceback" not in plant.output
-    assert not (tmp_path / "run").exists()
+    assert not any((tmp_path / "run").iterdir())
     assert policy.end(signal.SIGTERM) == 0
 
 

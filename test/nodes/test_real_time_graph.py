@@ -32,6 +32,11 @@ def test_plant_falls_back_when_the_policy_stops_and_drives_to_the_end(graph, cyc
     assert not result["lockstep"]
 
 
+def test_plant_looks_more_often_than_it_steps(graph, cycle):
+    plant = graph.plant(cycle=cycle, mode="real_time", period_s=0.006)
+    assert min(timer.timer_period_ns for timer in plant._node.timers) < 6_000_000
+
+
 def test_plant_obeys_one_policy_only(graph, cycle):
     graph.policy(Answerer(RuleBased(PAPER)), "one_policy")
     plant = graph.plant(cycle=cycle, mode="real_time", period_s=0.05, command_timeout_s=0.2)

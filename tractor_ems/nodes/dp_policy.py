@@ -26,8 +26,8 @@ PARAMETERS = (
         -1,
         1,
     ),
-    Parameter("soc_points", 401, "nodes of the SOC grid at every step", "nodes", 3, 100_000),
-    Parameter("actions", 1600, "battery powers of the action grid", "actions", 2, 100_000),
+    Parameter("soc_points", 401, "nodes of the SOC grid at every step", "nodes", 4, 5_000),
+    Parameter("actions", 1600, "battery powers of the action grid", "actions", 2, 20_000),
 )
 
 

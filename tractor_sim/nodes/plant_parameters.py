@@ -1,9 +1,24 @@
-"""The parameters of ``plant_sim``: each with description, unit and range."""
+"""The parameters of ``plant_sim``, each with unit and range, and the pace they ask for.
 
+No node in here.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from tractor_msgs_py.errors import ConfigError
 from tractor_msgs_py.ros.shell import Parameter
-from tractor_sim.plant_run import UNSET_SOC
+from tractor_sim.lockstep import Lockstep
+from tractor_sim.pace import Pace
+from tractor_sim.plant_run import UNSET_SOC, PlantRun
+from tractor_sim.real_time import RealTime
 
 WALL = "s wall clock"
+POLL_S = 0.02
+"""How often the plant looks whether it is time for something, at the least [s]."""
+
+MIN_PERIOD_S = 0.005
+"""Shortest step in real time that a node in Python keeps up with [s]."""
 
 PARAMETERS = (
     Parameter("powertrain", "paper", "powertrain, a shipped name or a YAML file"),
@@ -30,7 +45,35 @@ PARAMETERS = (
     ),
     Parameter("match_timeout_s", 0.0, "wait for a policy, 0 waits for ever", WALL, 0, 86400),
     Parameter("answer_timeout_s", 10.0, "lockstep: wait for one answer", WALL, 0.01, 3600),
-    Parameter("period_s", 0.0, "real time: of one step, 0 for the cycle's", WALL, 0, 60),
+    Parameter(
+        "period_s",
+        0.0,
+        f"real time: of one step, at least {MIN_PERIOD_S}, 0 for the cycle's",
+        WALL,
+        0,
+        60,
+    ),
     Parameter("command_timeout_s", 2.0, "real time: oldest command obeyed", WALL, 0.01, 60),
-    Parameter("output", "", "folder for trajectory.csv and result.json, empty for none"),
+    Parameter(
+        "output",
+        "",
+        "folder for trajectory.csv and result.json, empty for none; an old result is removed",
+    ),
+    Parameter("command_line", "", "what to record as the origin of the run, empty for its own"),
 )
+
+
+def pace_of(run: PlantRun, values: Mapping[str, Any]) -> tuple[Pace, float]:
+    """The pace that was asked for and how often to poll it [s].
+
+    Raises:
+        ConfigError: steps too short for a wall clock.
+    """
+    match_timeout_s = values["match_timeout_s"]
+    if run.info.lockstep:
+        return Lockstep(run, values["answer_timeout_s"], match_timeout_s), POLL_S
+    period_s = values["period_s"] or run.params.dt_s
+    if period_s < MIN_PERIOD_S:
+        raise ConfigError(f"parameter period_s: {period_s:g}, allowed {MIN_PERIOD_S}..60 or 0")
+    pace = RealTime(run, period_s, values["command_timeout_s"], match_timeout_s)
+    return pace, min(POLL_S, period_s / 2)

@@ -3,7 +3,6 @@
 ``plant_run`` is the plant, ``lockstep`` and ``real_time`` decide when it steps.
 """
 
-import shlex
 import sys
 import time
 from collections.abc import Iterable, Mapping
@@ -18,19 +17,18 @@ from rclpy.publisher import Publisher
 from tractor_msgs_py import topics
 from tractor_msgs_py.codec import decode_command, encode
 from tractor_msgs_py.errors import BagError
+from tractor_msgs_py.provenance import command_line
 from tractor_msgs_py.ros.delivery import Delivery
 from tractor_msgs_py.ros.diagnostics import PERIOD_S, diagnostic_array
 from tractor_msgs_py.ros.messages import RosMessages
 from tractor_msgs_py.ros.shell import run_node
 from tractor_msgs_py.ros.wire import publish_on, subscribe_to
 from tractor_msgs_py.types import Sample
-from tractor_sim.lockstep import Lockstep, Peers
-from tractor_sim.nodes.plant_parameters import PARAMETERS
-from tractor_sim.plant_run import PlantRun, prepare_run
-from tractor_sim.real_time import RealTime
-from tractor_sim.run_files import line_of, summary, write_run
+from tractor_sim.nodes.plant_parameters import PARAMETERS, pace_of
+from tractor_sim.pace import Peers
+from tractor_sim.plant_run import prepare_run
+from tractor_sim.run_files import clear_run, line_of, summary, write_run
 
-POLL_S = 0.02
 DELIVERY_S = 5.0
 """How long the end of a run is repeated to subscribers that have not acknowledged it [s]."""
 
@@ -47,10 +45,12 @@ class PlantSim:
             values["soc_target"],
             values["mode"],
             values["expected_recorders"],
-            shlex.join(sys.argv),
+            values["command_line"] or command_line(),
         )
-        self._pace = _pace(self._run, values)
+        self._pace, poll_s = pace_of(self._run, values)
         self._output = Path(values["output"]) if values["output"] else None
+        if self._output is not None:
+            clear_run(self._output)
         self._done_s: float | None = None
         self._code: int | None = None
         sent = (topics.RUN_INFO, topics.POWER_DEMAND, topics.BATTERY, topics.POWERTRAIN)
@@ -58,7 +58,7 @@ class PlantSim:
         self._commands = subscribe_to(node, topics.COMMAND, self._on_command)
         self._diagnostics = publish_on(node, topics.DIAGNOSTICS)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(POLL_S, self._poll, clock=steady)
+        node.create_timer(poll_s, self._poll, clock=steady)
         node.create_timer(PERIOD_S, self._diagnose, clock=steady)
         self._publish((self._run.info,))
         self._beginning, self._end = Delivery([self._message(self._run.info)]), Delivery([])
@@ -131,13 +131,6 @@ class PlantSim:
 
     def shutdown(self) -> None:
         """Nothing to make safe: the plant is simulated."""
-
-
-def _pace(run: PlantRun, values: Mapping[str, Any]) -> Lockstep | RealTime:
-    if run.info.lockstep:
-        return Lockstep(run, values["answer_timeout_s"], values["match_timeout_s"])
-    period_s = values["period_s"] or run.params.dt_s
-    return RealTime(run, period_s, values["command_timeout_s"], values["match_timeout_s"])
 
 
 def main() -> int:
