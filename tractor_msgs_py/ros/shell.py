@@ -85,6 +85,11 @@ def qos_profile(qos: Qos) -> QoSProfile:
     )
 
 
+def _overrides(node: Node) -> Mapping[str, Any]:
+    """What command line and parameter files set, by name. rclpy has no public way to ask."""
+    return node._parameter_overrides
+
+
 def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Any]:
     """Declare every parameter and return the values.
 
@@ -92,6 +97,7 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Any]:
         ConfigError: a value of the wrong type or outside its range, or an override whose name
             is not declared (rclpy ignores those silently).
     """
+    given = _overrides(node)
     values = {}
     for parameter in parameters:
         descriptor = ParameterDescriptor(description=parameter.text, read_only=True)
@@ -111,7 +117,7 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Any]:
         try:
             value = node.declare_parameter(parameter.name, parameter.default, descriptor).value
         except (InvalidParameterTypeException, InvalidParameterValueException) as error:
-            got = node._parameter_overrides.get(parameter.name)
+            got = given.get(parameter.name)
             shown = got.value if got is not None else error
             kind = type(parameter.default).__name__
             raise ConfigError(
@@ -121,7 +127,7 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Any]:
             raise ConfigError(f"parameter {parameter.name}: {value!r}; {parameter.text}")
         values[parameter.name] = value
     known = {parameter.name for parameter in parameters}
-    for name in node._parameter_overrides:
+    for name in given:
         if name not in known and name not in _BUILT_IN and not name.startswith("qos_overrides."):
             raise ConfigError(
                 f"parameter {name}: unknown, declared are {', '.join(sorted(known))}"
