@@ -7,17 +7,20 @@ file's embedded powertrain passes the same checks.
 from pathlib import Path
 from typing import Annotated
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from tractor_msgs_py.errors import ConfigError
 from tractor_sim.powertrain import PowertrainParams
 from tractor_sim.powertrain_json import params_from_json
 from tractor_sim.resources import resource_path
+from tractor_sim.yaml_file import read_yaml
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
+
+_SHOWN = 80
+"""Characters of a wrong value that an error message repeats."""
 
 
 class _Strict(BaseModel):
@@ -69,14 +72,7 @@ def load_powertrain(name_or_path: str | Path) -> PowertrainParams:
     """
     path = _find(name_or_path)
     try:
-        text = path.read_text(encoding="utf-8")
-        data = yaml.safe_load(text)
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read ({error})") from None
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: not YAML ({' '.join(str(error).split())})") from None
-    try:
-        checked = _Powertrain.model_validate(data)
+        checked = _Powertrain.model_validate(read_yaml(path))
     except ValidationError as error:
         raise ConfigError(f"{path}: {describe(error)}") from None
     try:
@@ -90,7 +86,16 @@ def describe(error: ValidationError) -> str:
     first = error.errors()[0]
     where = ".".join(str(part) for part in first["loc"]) or "document"
     more = error.error_count() - 1
-    return f"{where}: {first['msg']} (got {first['input']!r})" + (f", {more} more" if more else "")
+    shown = _shown(first["input"])
+    return f"{where}: {first['msg']} (got {shown})" + (f", {more} more" if more else "")
+
+
+def _shown(value: object) -> str:
+    try:
+        text = repr(value)
+    except ValueError:  # Python prints no integer of more than 4300 digits
+        return "a number of thousands of digits"
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
 
 
 def _find(name_or_path: str | Path) -> Path:

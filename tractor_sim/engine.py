@@ -37,13 +37,23 @@ class EngineParams:
     ramp_w_per_s: float = float("inf")
 
     def __post_init__(self) -> None:
+        for name in ("power_max_w", "fuel_lhv_j_per_kg"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ConfigError(f"engine.{name}: {value}, allowed finite and > 0")
+        for name in ("idle_fuel_kg_per_s", "start_fuel_kg", "min_on_s", "min_off_s"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise ConfigError(f"engine.{name}: {value}, allowed finite and >= 0")
+        if not self.ramp_w_per_s > 0:
+            raise ConfigError(f"engine.ramp_w_per_s: {self.ramp_w_per_s}, allowed > 0")
         power, efficiency = np.array(self.curve_power_w), np.array(self.curve_efficiency)
         if len(power) < 2 or len(power) != len(efficiency):
             raise ConfigError(
                 f"engine.curve_power_w: {len(power)} powers, {len(efficiency)} efficiencies, "
                 "at least 2 of each in equal number"
             )
-        if power[0] != 0.0 or np.any(np.diff(power) <= 0):
+        if power[0] != 0.0 or not np.all(np.diff(power) > 0):
             raise ConfigError("engine.curve_power_w: must start at 0 and increase")
         if power[-1] != self.power_max_w:
             raise ConfigError(

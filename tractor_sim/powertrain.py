@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tractor_msgs_py.errors import ConfigError
 from tractor_msgs_py.trajectory import BoolArray, FloatArray
 from tractor_sim import battery as _battery
 from tractor_sim import engine as _engine
@@ -30,6 +31,9 @@ from tractor_sim.generator import GeneratorParams
 ROUNDING_W = 1e-6
 """A bus imbalance below this is rounding: neither shortfall nor a reason to start the engine."""
 
+DT_MAX_S = 60.0
+AUX_MAX_W = 1e9
+
 
 @dataclass(frozen=True)
 class PowertrainParams:
@@ -38,10 +42,12 @@ class PowertrainParams:
     Attributes:
         name: short name, for instance ``paper``.
         engine, generator, battery: its components.
-        p_aux_w: auxiliary power added to a cycle's demand [W].
-        dt_s: step length [s].
+        p_aux_w: auxiliary power added to a cycle's demand, >= 0 [W].
+        dt_s: step length, 0 < dt_s <= 60 [s].
         soc_initial: SOC a run starts at unless told otherwise.
         soc_target: SOC a run should end at; None: where it started.
+
+    Raises ConfigError where a value is out of range.
     """
 
     name: str
@@ -52,6 +58,17 @@ class PowertrainParams:
     dt_s: float
     soc_initial: float
     soc_target: float | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.dt_s <= DT_MAX_S:
+            raise ConfigError(f"dt_s: {self.dt_s}, allowed 0 < dt_s <= {DT_MAX_S:g}")
+        if not 0.0 <= self.p_aux_w <= AUX_MAX_W:
+            raise ConfigError(f"p_aux_w: {self.p_aux_w}, allowed 0..{AUX_MAX_W:g}")
+        window = (self.battery.soc_min, self.battery.soc_max)
+        for name in ("soc_initial", "soc_target"):
+            soc = getattr(self, name)
+            if soc is not None and not window[0] <= soc <= window[1]:
+                raise ConfigError(f"{name}: {soc}, allowed {window[0]}..{window[1]}")
 
 
 @dataclass(frozen=True)

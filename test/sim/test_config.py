@@ -1,8 +1,12 @@
 """Bad powertrain files are refused in one line that names file, field and value."""
 
+import copy
+from itertools import pairwise
+
 import pytest
 import yaml
 
+from tractor_ems.learning.config import load_train_config
 from tractor_msgs_py.errors import ConfigError
 from tractor_sim.config import load_powertrain
 from tractor_sim.powertrain_json import params_from_json, params_to_json, powertrain_hash
@@ -58,6 +62,58 @@ def test_text_that_is_not_yaml_is_refused(tmp_path):
     path.write_text("engine: [1,\n  {")
     with pytest.raises(ConfigError, match="not YAML"):
         load_powertrain(path)
+
+
+def test_a_powertrain_that_never_saw_the_schema_meets_the_same_ranges():
+    """A policy file embeds its powertrain as JSON; no YAML schema stands in front of that."""
+    whole = params_to_json(load_powertrain("paper"))
+    for section, field, value in [
+        ("engine", "fuel_lhv_j_per_kg", -1.0),
+        ("engine", "idle_fuel_kg_per_s", float("nan")),
+        ("engine", "min_off_s", float("inf")),
+        ("engine", "ramp_w_per_s", -5.0),
+        ("engine", "curve_power_w", [0.0, float("nan"), 275e3]),
+        (None, "dt_s", 0.0),
+        (None, "dt_s", float("nan")),
+        (None, "p_aux_w", float("inf")),
+        (None, "p_aux_w", 10**400),
+        (None, "soc_target", 2.0),
+    ]:
+        data = copy.deepcopy(whole)
+        (data[section] if section else data)[field] = value
+        with pytest.raises(ConfigError, match="int too large" if value == 10**400 else field):
+            params_from_json(data)
+
+
+NOT_SETTINGS = {
+    "a month 13": ("name: 2023-13-01", "cannot be read"),
+    "too many digits": (f"dt_s: {'9' * 5000}", "cannot be read"),
+    "too many hexadecimal digits": (f"seed: 0x{'f' * 9000}", "thousands of digits"),
+    "deep nesting": ("name: " + "[" * 5000, "not YAML"),
+    "nested aliases": (
+        "a: &a [1]\n"
+        + "".join(f"{b}: &{b} [{f'*{a}, ' * 9}]\n" for a, b in pairwise("abcdefghi")),
+        "alias *a, no aliases",
+    ),
+    "a large file": ("#" * 2_000_000, "bytes a settings file may have"),
+    "text of no encoding": (None, "cannot be read"),
+}
+
+
+@pytest.mark.parametrize("case", NOT_SETTINGS)
+@pytest.mark.parametrize("load", [load_powertrain, load_train_config])
+def test_no_yaml_content_ends_in_a_traceback(case, load, tmp_path):
+    text, reason = NOT_SETTINGS[case]
+    path = tmp_path / "mine.yaml"
+    if text is None:
+        path.write_bytes(b"\xff\xfe\xfd")
+    else:
+        path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        load(path)
+    message = str(caught.value)
+    assert "mine.yaml" in message and "\n" not in message and len(message) < 500
+    assert reason in message
 
 
 def test_an_unknown_name_lists_the_shipped_ones():

@@ -6,7 +6,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
@@ -14,6 +13,7 @@ from tractor_ems.learning.rewards import RewardConfig
 from tractor_msgs_py.errors import ConfigError
 from tractor_sim.config import describe
 from tractor_sim.resources import resource_path
+from tractor_sim.yaml_file import read_yaml
 
 _STRICT = ConfigDict(extra="forbid")
 
@@ -177,12 +177,7 @@ def load_train_config(
     if preset is not None:
         path = _find(preset)
         source = str(path)
-        try:
-            loaded = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{path}: cannot be read ({error})") from None
-        except yaml.YAMLError as error:
-            raise ConfigError(f"{path}: not YAML ({' '.join(str(error).split())})") from None
+        loaded = read_yaml(path)
         if not isinstance(loaded, dict):
             raise ConfigError(f"{path}: {type(loaded).__name__}, expected a mapping of settings")
         data = loaded

@@ -4,7 +4,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Literal
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from tractor_msgs_py.errors import ConfigError, CycleError
@@ -12,6 +11,7 @@ from tractor_sim.config import describe
 from tractor_sim.duty_cycle.cycle import DutyCycle, Split, read_cycle_csv
 from tractor_sim.duty_cycle.planter import PlanterParams, planter_demand_w
 from tractor_sim.resources import resource_path
+from tractor_sim.yaml_file import read_yaml
 
 Watt = Annotated[float, Field(ge=-1e9, le=1e9)]
 Second = Annotated[int, Field(gt=0, le=1_000_000)]
@@ -48,9 +48,7 @@ class _Planter(BaseModel):
 def _planter() -> _Planter:
     path = resource_path("config", "cycle", "planter.yaml")
     try:
-        return _Planter.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
-    except (OSError, yaml.YAMLError) as error:
-        raise ConfigError(f"{path}: {' '.join(str(error).split())}") from None
+        return _Planter.model_validate(read_yaml(path))
     except ValidationError as error:
         raise ConfigError(f"{path}: {describe(error)}") from None
 
