@@ -1,5 +1,6 @@
 """Policy files: a round trip to the byte, and one line for everything that is wrong with one."""
 
+import hashlib
 import json
 import os
 import struct
@@ -104,6 +105,13 @@ BAD = {
         {"tensors": {"layer1.weight": np.ones((5, 8), "f4"), "layer1.bias": np.ones(5, "f4")}},
         "to 5 outputs",
     ),
+    "no layers": ({"network": {"layers": 0, "activation": "tanh"}}, "allowed whole numbers 1..16"),
+    "endless layers": ({"network": {"layers": 10**10, "activation": "tanh"}}, "layers"),
+    "no actions": ({"actions": 0}, "actions: 0, allowed whole numbers 2..30000"),
+    "endless actions": ({"actions": 10**14}, "actions"),
+    "infinite actions": ({"actions": float("inf")}, "actions: inf"),
+    "actions as text": ({"actions": "1600"}, "actions: '1600'"),
+    "gamma of 400 digits": ({"gamma": 10**400}, "metadata is not a policy's"),
     "other inputs": ({"tensors": {"layer0.weight": np.ones((8, 6), "f4")}}, "maps 6 inputs"),
 }
 
@@ -116,6 +124,32 @@ def test_a_wrong_policy_file_gets_one_line_that_names_it(case: str, file: Path):
         load_policy(file)
     message = str(caught.value)
     assert reason in message and str(file) in message and "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("section", "field", "value"),
+    [
+        (None, "dt_s", 0.0),
+        ("engine", "fuel_lhv_j_per_kg", -1.0),
+        ("engine", "start_fuel_kg", -1.0),
+    ],
+)
+def test_an_embedded_powertrain_is_checked_even_where_its_hash_fits(
+    section: str | None, field: str, value: float, file: Path
+):
+    powertrain = read_policy_file(file)[1]["powertrain"]
+    (powertrain[section] if section else powertrain)[field] = value
+    text = json.dumps(powertrain, sort_keys=True, separators=(",", ":"))
+    rewrite(file, powertrain=powertrain, powertrain_hash=hashlib.sha256(text.encode()).hexdigest())
+    with pytest.raises(PolicyError, match=field):
+        load_policy(file)
+
+
+def test_metadata_nested_too_deeply_is_refused(file: Path):
+    deep = "[" * 100_000
+    save_file({"x": np.ones(3, np.float32)}, str(file), metadata={"tractor_ems.policy": deep})
+    with pytest.raises(PolicyError, match="not a policy document"):
+        load_policy(file)
 
 
 def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path):

@@ -71,7 +71,7 @@ def read_policy_file(path: Path) -> tuple[dict[str, Float32Array], dict[str, Any
     try:
         metadata = json.loads(document)
         version = metadata["format_version"]
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         raise PolicyError(f"{path}: its metadata is not a policy document") from None
     if version != FORMAT_VERSION:
         raise PolicyError(f"{path}: format version {version!r}, this package reads 1")

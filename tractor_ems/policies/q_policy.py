@@ -2,6 +2,7 @@
 plant in front of it. numpy and safetensors only: neither torch nor a validation library.
 """
 
+import reprlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -31,6 +32,9 @@ from tractor_sim.powertrain_json import params_from_json, params_to_json, powert
 
 Kind = Literal["ddqn_counterfactual", "ddqn_sampled"]
 KINDS: tuple[Kind, ...] = ("ddqn_counterfactual", "ddqn_sampled")
+
+LAYERS_MAX = 16
+ACTIONS_MIN, ACTIONS_MAX = 2, 30_000
 
 
 @dataclass(frozen=True)
@@ -304,7 +308,7 @@ def load_policy(path: str | Path) -> QPolicy:
         return _policy_from(tensors, data)
     except (PolicyError, ConfigError) as error:
         raise PolicyError(f"{path}: {error}") from None
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise PolicyError(f"{path}: metadata is not a policy's ({error!r})") from None
 
 
@@ -315,9 +319,9 @@ def _policy_from(tensors: dict[str, Float32Array], data: dict[str, Any]) -> QPol
     params = params_from_json(data["powertrain"])
     if powertrain_hash(params) != data["powertrain_hash"]:
         raise PolicyError("powertrain parameters do not match their hash")
-    layers = int(data["network"]["layers"])
+    layers = _count(data["network"], "layers", 1, LAYERS_MAX)
     names = {f"layer{n}.{part}" for n in range(layers) for part in ("weight", "bias")}
-    if layers < 1 or set(tensors) != names:
+    if set(tensors) != names:
         raise PolicyError(f"tensors {sorted(tensors)}, expected {sorted(names)}")
     weights = tuple(tensors[f"layer{n}.weight"] for n in range(layers))
     biases = tuple(tensors[f"layer{n}.bias"] for n in range(layers))
@@ -341,9 +345,17 @@ def _policy_from(tensors: dict[str, Float32Array], data: dict[str, Any]) -> QPol
         net=Mlp(weights, biases, activation),
         scaling=Normalisation(**data["normalisation"]),
         gamma=float(data["gamma"]),
-        actions=int(data["actions"]),
+        actions=_count(data, "actions", ACTIONS_MIN, ACTIONS_MAX),
         metadata=data,
     )
+
+
+def _count(data: dict[str, Any], name: str, least: int, most: int) -> int:
+    """A declared size: bounded, because arrays are made to it before anything else is checked."""
+    value = data[name]
+    if type(value) is not int or not least <= value <= most:
+        raise PolicyError(f"{name}: {reprlib.repr(value)}, allowed whole numbers {least}..{most}")
+    return value
 
 
 def check_powertrain(policy: QPolicy, expected_hash: str) -> None:
