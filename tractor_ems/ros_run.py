@@ -1,6 +1,6 @@
 """One run through the real nodes as separate processes: plant, policy and, if asked, recorder.
 
-Standard library only, no rclpy in this process. Whatever happens, no child outlives the call.
+No rclpy in this process. Whatever happens, short of SIGKILL, no child outlives the call.
 """
 
 import csv
@@ -15,7 +15,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +23,9 @@ from types import FrameType
 from typing import Any
 
 from tractor_ems.scenario import Scenario
+from tractor_msgs_py.atomic import sync_folder
 from tractor_msgs_py.errors import ConfigError, RunAborted
+from tractor_msgs_py.provenance import command_line
 from tractor_msgs_py.trajectory import Trajectory
 from tractor_sim.run_files import read_run
 
@@ -89,7 +91,8 @@ def run_ros(
         policy: executable and parameters of the policy node; ``dp_policy`` is given the
             scenario besides.
         scenario: what to drive.
-        record: folder of a new bag; None records nothing. It is removed if the run fails.
+        record: folder of a new bag; None records nothing. It appears when the run is over;
+            until then the bag grows in a hidden folder beside it, which a failed run removes.
         timeout_s: wall clock for everything [s].
         domain_id: ROS domain 0..232; None: :data:`DOMAIN_VARIABLE`, or else a free one.
 
@@ -102,36 +105,42 @@ def run_ros(
         raise ConfigError("transport ros: no rclpy, install the extra 'ros' or source ROS 2")
     if record is not None and record.exists():
         raise ConfigError(f"{record}: exists already, a recording overwrites nothing")
-    name, arguments = policy
     with (
-        _sigterm_unwinds(),
+        _signals_noted() as signals,
         tempfile.TemporaryDirectory(prefix="tractor_ems_") as folder_name,
         _domain(domain_id) as domain,
+        _place_for(record) as bag,
     ):
         folder = Path(folder_name)
-        what = _scenario_parameters(scenario, folder)
-        plant = {
-            **what,
-            "output": str(folder / "run"),
-            "expected_recorders": int(record is not None),
-            "match_timeout_s": MATCH_S,
-        }
         nodes: list[_Node] = []
         try:
-            nodes.append(_start("plant_sim", plant, folder, domain))
-            given = {**what, **arguments} if name == "dp_policy" else arguments
-            nodes.append(_start(name, given, folder, domain))
-            if record is not None:
-                nodes.append(_start("bag_recorder", {"output": str(record)}, folder, domain))
-            _wait(nodes, time.monotonic() + timeout_s)
+            for name, parameters in _what_to_start(policy, scenario, bag, folder).items():
+                nodes.append(_start(name, parameters, folder, domain))
+            _wait(nodes, time.monotonic() + timeout_s, signals)
             trajectory, run = read_run(folder / "run")
-        except BaseException:
+        except OSError as error:
+            raise RunAborted(f"nodes cannot be started: {error}") from None
+        finally:
             _stop(nodes)
-            if record is not None:
-                shutil.rmtree(record, ignore_errors=True)
-            raise
-        _stop(nodes)
     return RosRunResult(trajectory, run, record)
+
+
+def _what_to_start(
+    policy: tuple[str, Mapping[str, object]], scenario: Scenario, bag: Path | None, folder: Path
+) -> dict[str, Mapping[str, object]]:
+    """Executables with their parameters: the plant, then the policy, then the recorder."""
+    name, arguments = policy
+    what = _scenario_parameters(scenario, folder)
+    plant = {
+        **what,
+        "output": str(folder / "run"),
+        "expected_recorders": int(bag is not None),
+        "match_timeout_s": MATCH_S,
+        # Bytes that are no text cannot be a parameter.
+        "command_line": command_line().encode(errors="replace").decode(),
+    }
+    nodes = {"plant_sim": plant, name: {**what, **arguments} if name == "dp_policy" else arguments}
+    return nodes if bag is None else {**nodes, "bag_recorder": {"output": str(bag)}}
 
 
 def _scenario_parameters(scenario: Scenario, folder: Path) -> dict[str, object]:
@@ -158,7 +167,7 @@ def _start(name: str, parameters: Mapping[str, object], folder: Path, domain: in
         command += ["-r", f"__node:={parameters['policy']}_policy"]  # a bag names its policy so
     for key, value in parameters.items():
         # JSON scalars are YAML scalars: a quoted string cannot turn into a number.
-        command += ["-p", f"{key}:={json.dumps(value)}"]
+        command += ["-p", f"{key}:={json.dumps(value, ensure_ascii=False)}"]
     environment = {
         **{key: value for key, value in os.environ.items() if key != "ROS_LOCALHOST_ONLY"},
         "ROS_DOMAIN_ID": str(domain),
@@ -173,10 +182,12 @@ def _start(name: str, parameters: Mapping[str, object], folder: Path, domain: in
     return _Node(name, process, log)
 
 
-def _wait(nodes: list[_Node], deadline_s: float) -> None:
-    """Until the plant and then the recorder are done; raises where any of them is not."""
+def _wait(nodes: Sequence[_Node], deadline_s: float, signals: Sequence[int]) -> None:
+    """Until the plant and then the recorder are done; raises where any of them is not, or where
+    a signal was noted."""
     plant, policy, *recorders = nodes
     while plant.process.poll() is None:
+        _obey(signals)
         for other in (policy, *recorders):
             if other.process.poll() and plant.process.poll() is None:
                 raise _failure(other)
@@ -187,14 +198,16 @@ def _wait(nodes: list[_Node], deadline_s: float) -> None:
         time.sleep(POLL_S)
     if plant.process.returncode != 0:
         raise _failure(policy if policy.process.poll() else plant)
+    deadline_s = min(deadline_s, time.monotonic() + RECORDER_S)
     for recorder in recorders:
-        try:
-            code = recorder.process.wait(min(RECORDER_S, max(deadline_s - time.monotonic(), 0.0)))
-        except subprocess.TimeoutExpired:
-            raise RunAborted(
-                f"bag_recorder: did not see the end of the run: {recorder.line()}"
-            ) from None
-        if code != 0:
+        while recorder.process.poll() is None:
+            _obey(signals)
+            if time.monotonic() > deadline_s:
+                raise RunAborted(
+                    f"bag_recorder: did not see the end of the run: {recorder.line()}"
+                )
+            time.sleep(POLL_S)
+        if recorder.process.returncode != 0:
             raise _failure(recorder)
 
 
@@ -205,7 +218,7 @@ def _failure(node: _Node) -> ConfigError | RunAborted:
     return ConfigError(node.line()) if code == 2 else RunAborted(node.line())
 
 
-def _stop(nodes: list[_Node]) -> None:
+def _stop(nodes: Sequence[_Node]) -> None:
     """End and reap every child, those that do not listen by force."""
     for node in nodes:
         if node.process.poll() is None:
@@ -241,17 +254,61 @@ def _domain(wanted: int | None) -> Iterator[int]:
 
 
 @contextmanager
-def _sigterm_unwinds() -> Iterator[None]:
-    """SIGTERM ends this process through its ``finally`` clauses, so that no child is left."""
+def _place_for(record: Path | None) -> Iterator[Path | None]:
+    """Where to record: a bag of that name in a hidden folder beside, put in place at the end.
 
-    def unwind(number: int, _frame: FrameType | None) -> None:
-        raise SystemExit(128 + number)
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
+    Whoever makes ``record`` in the meantime keeps it; the run fails then.
+    """
+    if record is None:
+        yield None
         return
-    before = signal.signal(signal.SIGTERM, unwind)
     try:
-        yield
+        record.parent.mkdir(parents=True, exist_ok=True)
+        hidden = Path(tempfile.mkdtemp(prefix=f".{record.name}.", dir=record.parent))
+    except OSError as error:
+        raise ConfigError(f"{record}: cannot be created ({error.strerror})") from None
+    try:
+        yield hidden / record.name
+        try:
+            os.rename(hidden / record.name, record)
+            sync_folder(record.parent)
+        except OSError as error:
+            raise RunAborted(f"{record}: cannot be put in place ({error.strerror})") from None
     finally:
-        signal.signal(signal.SIGTERM, before)
+        shutil.rmtree(hidden, ignore_errors=True)
+
+
+@contextmanager
+def _signals_noted() -> Iterator[Sequence[int]]:
+    """SIGINT and SIGTERM are noted instead of raised wherever this process happens to be.
+
+    Between the start of a child and its entry in the list, or half way through ending them all,
+    an exception would leave one behind. :func:`_obey` raises where it is safe; what came after
+    its last call is raised at the end.
+    """
+    noted: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield noted
+        return
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        noted.append(number)
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:
+            signal.signal(number, note)
+    try:
+        yield noted
+        _obey(noted)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _obey(signals: Sequence[int]) -> None:
+    """End this process through its ``finally`` clauses where a signal was noted."""
+    if signal.SIGINT in signals:
+        raise KeyboardInterrupt
+    if signals:
+        raise SystemExit(128 + signals[0])

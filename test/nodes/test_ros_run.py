@@ -15,6 +15,7 @@ from tractor_ems.policies.rules import Conventional, RuleBased
 from tractor_ems.ros_run import DOMAIN_VARIABLE, run_ros
 from tractor_ems.scenario import make_scenario
 from tractor_msgs_py.errors import ConfigError, RunAborted
+from tractor_msgs_py.provenance import command_line
 from tractor_msgs_py.trajectory import trajectory_hash
 
 DEMAND_W = [60e3, 150e3, 200e3, 90e3, 20e3, 180e3, 240e3, 105e3, 130e3, 40e3, 110e3, 150e3]
@@ -48,6 +49,8 @@ def test_recorded_run_equals_the_in_process_run_and_its_bag(scenario, tmp_path):
     (run,) = read_bag(tmp_path / "bag")
     hashes = {trajectory_hash(result.trajectory), trajectory_hash(trajectory_of(run))}
     assert hashes == {expected(Conventional(), scenario), result.run["trajectory_hash"]}
+    assert [path.name for path in tmp_path.glob("*bag*")] == ["bag"]
+    assert result.run["command_line"] == run.info.command_line == command_line()
     assert run.complete and run.policy == "conventional" and result.bag == tmp_path / "bag"
 
 
@@ -75,7 +78,7 @@ def test_bad_input_of_a_node_is_one_line_and_leaves_no_bag(scenario, tmp_path):
         run_ros(("ddqn_policy", {"policy_file": missing}), scenario, record=tmp_path / "bag")
     assert str(error.value).startswith("ddqn_policy: ") and missing in str(error.value)
     assert "\n" not in str(error.value)
-    assert not (tmp_path / "bag").exists()
+    assert not list(tmp_path.glob("*bag*"))
 
 
 def test_an_existing_bag_is_refused_and_kept(scenario, tmp_path):
@@ -85,11 +88,49 @@ def test_an_existing_bag_is_refused_and_kept(scenario, tmp_path):
     assert (tmp_path / "bag").is_dir()
 
 
+@pytest.mark.parametrize("otherwise", ["fails", "succeeds"])
+def test_a_bag_that_somebody_else_makes_meanwhile_is_kept(
+    scenario, monkeypatch, tmp_path, otherwise
+):
+    real, theirs = ros_run._wait, tmp_path / "bag" / "theirs.mcap"
+
+    def lose_the_race(nodes, deadline_s, signals):
+        theirs.parent.mkdir()
+        theirs.write_text("precious")
+        if otherwise == "fails":
+            raise RunAborted("the run failed")
+        real(nodes, deadline_s, signals)
+
+    monkeypatch.setattr(ros_run, "_wait", lose_the_race)
+    with pytest.raises(RunAborted, match=r"the run failed|cannot be put in place"):
+        run_ros(RULES, scenario, record=tmp_path / "bag")
+    assert theirs.read_text() == "precious"
+    assert [path.name for path in tmp_path.glob("*bag*")] == ["bag"]
+
+
+def test_a_cycle_file_with_any_name_reaches_the_plant(make_cycle):
+    named = make_scenario("paper", make_cycle(DEMAND_W, "acker 🚜 'ä\""), 0.8, 0.8)
+    result = run_ros(RULES, named)
+    assert trajectory_hash(result.trajectory) == expected(RuleBased(named.params), named)
+
+
+@pytest.mark.parametrize(
+    ("code", "error"), [(2, ConfigError), (3, RunAborted), (1, RunAborted), (-9, RunAborted)]
+)
+def test_the_exit_code_of_a_node_says_whether_input_was_bad(tmp_path, code, error):
+    script = f"import os, sys; os.kill(os.getpid(), 9) if {code} < 0 else sys.exit({code})"
+    process = subprocess.Popen([sys.executable, "-c", script])
+    process.wait(60)
+    (tmp_path / "log").write_text("bag_recorder: no space left on device\n")
+    failure = ros_run._failure(ros_run._Node("bag_recorder", process, tmp_path / "log"))
+    assert type(failure) is error
+
+
 @pytest.mark.parametrize("failure", [KeyboardInterrupt(), RuntimeError("anything")])
 def test_no_process_outlives_an_interrupted_call(scenario, monkeypatch, tmp_path, failure):
     children = []
 
-    def interrupt(nodes, deadline_s):
+    def interrupt(nodes, deadline_s, signals):
         children.extend(node.process for node in nodes)
         raise failure
 
@@ -100,13 +141,39 @@ def test_no_process_outlives_an_interrupted_call(scenario, monkeypatch, tmp_path
     assert all(child.returncode is not None for child in children)
 
 
+@pytest.mark.parametrize(
+    ("number", "ending"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)]
+)
+def test_no_process_outlives_signals_at_the_worst_moments(scenario, monkeypatch, number, ending):
+    children = []
+
+    class Child(subprocess.Popen):
+        """A signal comes before the caller knows of the child, and again while it is ended."""
+
+        def __init__(self, *args, **settings):
+            super().__init__(*args, **settings)
+            children.append(self)
+            signal.raise_signal(number)
+
+        def terminate(self):
+            signal.raise_signal(number)
+            super().terminate()
+
+    monkeypatch.setattr(ros_run.subprocess, "Popen", Child)
+    before = signal.getsignal(number)
+    with pytest.raises(ending):
+        run_ros(RULES, scenario)
+    assert children and all(child.returncode is not None for child in children)
+    assert signal.getsignal(number) is before
+
+
 def test_a_policy_that_is_killed_is_named(scenario, monkeypatch):
     real = ros_run._wait
 
-    def kill_policy(nodes, deadline_s):
+    def kill_policy(nodes, deadline_s, signals):
         nodes[1].process.kill()
         nodes[1].process.wait()
-        real(nodes, deadline_s)
+        real(nodes, deadline_s, signals)
 
     monkeypatch.setattr(ros_run, "_wait", kill_policy)
     with pytest.raises(RunAborted, match="rule_based_policy: killed by SIGKILL"):
