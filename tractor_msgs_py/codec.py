@@ -43,6 +43,15 @@ POWERTRAIN_NAMES = (
 _POWERTRAIN_FIELDS = tuple(field.name for field in dataclasses.fields(PowertrainReading))[1:]
 
 
+MAX_STEPS = 10_000_000
+"""Steps of the longest run: four months of seconds; readers build grids of this size."""
+
+MIN_DT_S, MAX_DT_S = 1e-3, 3600.0
+"""Step lengths that can be announced [s]."""
+
+_STAMP_END_NS = 2**63
+
+
 class MessageFactory(Protocol):
     """Builds messages of the three carrier types; one implementation per serialisation stack."""
 
@@ -156,8 +165,8 @@ def decode_run_info(msg: Any) -> RunInfo:
     """
     where = topics.RUN_INFO.name
     try:
-        data = json.loads(msg.data)
-    except ValueError as error:
+        data = json.loads(msg.data, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError, OverflowError) as error:
         raise BagError(f"{where}: not JSON ({error})") from None
     if not isinstance(data, dict):
         raise BagError(f"{where}: JSON {type(data).__name__}, expected an object")
@@ -172,16 +181,40 @@ def decode_run_info(msg: Any) -> RunInfo:
         wrong = not isinstance(value, int | float) if kind is float else type(value) is not kind
         if wrong or (kind is float and isinstance(value, bool)):
             raise BagError(f"{where}: field {field.name} is {value!r}, expected {kind}")
-        values[field.name] = float(value) if kind is float else value
+        values[field.name] = _finite(field.name, value) if kind is float else value
     info = RunInfo(**values)
-    if not (math.isfinite(info.dt_s) and 0.0 < info.dt_s <= 3600.0):
-        raise BagError(f"{where}: dt_s {info.dt_s}, allowed 0 < dt_s <= 3600")
-    if info.t0_ns <= 0 or info.steps < 1:
-        raise BagError(f"{where}: t0_ns {info.t0_ns}, steps {info.steps}, both must be > 0")
+    if not MIN_DT_S <= info.dt_s <= MAX_DT_S:
+        raise BagError(f"{where}: dt_s {info.dt_s}, allowed {MIN_DT_S}..{MAX_DT_S}")
+    if not 1 <= info.steps <= MAX_STEPS:
+        raise BagError(f"{where}: steps {_brief(info.steps)}, allowed 1..{MAX_STEPS}")
+    if info.t0_ns < 1 or info.stamp_ns(info.steps) >= _STAMP_END_NS:
+        raise BagError(
+            f"{where}: t0_ns {_brief(info.t0_ns)}, allowed from 1 to where the last stamp is "
+            f"below {_STAMP_END_NS}"
+        )
     for name in ("soc_initial", "soc_target"):
         if not 0.0 <= getattr(info, name) <= 1.0:
             raise BagError(f"{where}: {name} {getattr(info, name)}, allowed 0..1")
     return info
+
+
+def _refuse_constant(text: str) -> float:
+    raise ValueError(f"{text} is no JSON number")
+
+
+def _finite(name: str, value: int | float) -> float:
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise BagError(f"{topics.RUN_INFO.name}: {name} {_brief(value)}, must be finite")
+    return number
+
+
+def _brief(value: int | float) -> str:
+    """A number in a few characters: integers may have thousands of digits."""
+    return str(value) if abs(value) < 1 << 64 else "beyond 64 bits"
 
 
 DECODERS = {

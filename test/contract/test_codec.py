@@ -119,3 +119,35 @@ def test_topic_names_are_relative_and_nothing_asks_for_a_deadline():
     }
     assert topics.RUN_INFO.qos == topics.Qos(durability="transient_local", depth=1)
     assert np.all([topic.qos.reliability == "reliable" for topic in topics.RECORDED])
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"dt_s": 1e-12}, "dt_s"),
+        ({"dt_s": 1e-4}, "dt_s"),
+        ({"steps": 10**9}, "steps"),
+        ({"steps": 10**400}, "steps"),
+        ({"t0_ns": 2**63 - 1}, "t0_ns"),
+        ({"steps": 10_000_000, "dt_s": 3600.0}, "t0_ns"),
+        ({"p_aux_w": 10**400}, "p_aux_w"),
+    ],
+)
+def test_a_run_info_that_no_machine_can_drive_is_refused_in_one_short_line(change, named):
+    text = json.dumps({**dataclasses.asdict(INFO), **change})
+    with pytest.raises(BagError, match=named) as caught:
+        codec.decode_run_info(SimpleNamespace(data=text))
+    assert len(str(caught.value)) < 200
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "1e400"])
+def test_a_run_info_holds_finite_numbers_only(number):
+    text = json.dumps({**dataclasses.asdict(INFO), "p_aux_w": 0.5}).replace("0.5", number)
+    with pytest.raises(BagError, match=r"no JSON number|must be finite"):
+        codec.decode_run_info(SimpleNamespace(data=text))
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"steps": 1' + "0" * 5000 + "}"])
+def test_run_info_json_that_no_parser_takes_is_refused(text):
+    with pytest.raises(BagError, match="not JSON"):
+        codec.decode_run_info(SimpleNamespace(data=text))
