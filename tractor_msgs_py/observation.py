@@ -15,7 +15,19 @@ import numpy as np
 from tractor_msgs_py.codec import wire_soc
 from tractor_msgs_py.errors import PolicyError
 from tractor_msgs_py.trajectory import BoolArray, FloatArray
-from tractor_msgs_py.types import BatteryReading, PowerDemand, PowertrainReading, RunInfo
+from tractor_msgs_py.types import (
+    BatteryPowerCommand,
+    BatteryReading,
+    PowerDemand,
+    PowertrainReading,
+    RunInfo,
+)
+
+MAX_PENDING = 64
+"""Stamps that may wait for the rest of their samples."""
+
+MAX_POWER_W = 1e9
+"""A demand beyond this is no tractor's [W]."""
 
 SIGNALS = ("power_demand_w", "soc", "powertrain_state")
 """Signals the ``exact`` mode can supply."""
@@ -192,11 +204,12 @@ class ObservationBuilder:
     def add(self, sample: PowerDemand | BatteryReading | PowertrainReading) -> Observation | None:
         """The observation that ``sample`` completes, or None.
 
-        Stamps not newer than the last observation (resends), before a run, outside the run's
-        grid, or values that are not finite are refused.
+        Stamps not newer than the last observation (resends), before a run, and whatever
+        :func:`refusal` names are refused. Of the stamps that wait for the rest of their samples
+        the newest are kept; the others are counted as ``unjoined``.
         """
         run = self.run
-        reason = _refusal(sample, run)
+        reason = refusal(sample, run)
         if reason is None and sample.stamp_ns <= self.last_stamp_ns:
             reason = "repeated_or_old_stamp"
         if reason is not None or run is None:
@@ -205,6 +218,9 @@ class ObservationBuilder:
         joined = self._pending.setdefault(sample.stamp_ns, {})
         joined[type(sample)] = sample
         if len(joined) < 3:
+            if len(self._pending) > MAX_PENDING:
+                del self._pending[min(self._pending)]
+                self.refusals["unjoined"] += 1
             return None
         demand: PowerDemand = joined[PowerDemand]
         battery: BatteryReading = joined[BatteryReading]
@@ -231,22 +247,30 @@ class ObservationBuilder:
         )
 
 
-def _refusal(
-    sample: PowerDemand | BatteryReading | PowertrainReading, run: RunInfo | None
+def refusal(
+    sample: PowerDemand | BatteryReading | PowertrainReading | BatteryPowerCommand,
+    run: RunInfo | None,
 ) -> str | None:
-    if run is None:
-        return "no_run_info"
-    if run.lockstep:
-        ticks, rest = divmod(sample.stamp_ns - run.t0_ns, run.dt_ns)
-        if rest or not 0 <= ticks <= run.steps:
+    """Why a sample must not be used, or None: one rule for the live node and the bag reader.
+
+    ``zero_stamp``; with a run ``stamp_outside_run`` and, in lockstep, ``stamp_off_grid``;
+    ``soc_out_of_range``, ``not_finite``, ``demand_out_of_range``. The values of a command are
+    not judged: the plant projects whatever a policy answered.
+    """
+    if sample.stamp_ns <= 0:
+        return "zero_stamp"
+    if run is not None:
+        if not run.t0_ns <= sample.stamp_ns <= run.stamp_ns(run.steps):
             return "stamp_outside_run"
+        if run.lockstep and (sample.stamp_ns - run.t0_ns) % run.dt_ns:
+            return "stamp_off_grid"
     match sample:
         case PowerDemand():
             values: tuple[float, ...] = (sample.power_w,)
         case BatteryReading():
-            if not 0.0 <= sample.soc <= 1.0:
-                return "soc_out_of_range"
-            values = ()
+            return None if 0.0 <= sample.soc <= 1.0 else "soc_out_of_range"
+        case BatteryPowerCommand():
+            return None
         case PowertrainReading():
             values = (
                 sample.time_in_state_s,
@@ -254,5 +278,14 @@ def _refusal(
                 sample.charge_limit_w,
                 sample.discharge_limit_w,
                 sample.engine_limit_w,
+                sample.applied_battery_power_w,
+                sample.applied_engine_power_w,
+                sample.fuel_kg,
+                sample.shortfall_j,
+                sample.dissipated_j,
             )
-    return None if all(math.isfinite(value) for value in values) else "not_finite"
+    if not all(math.isfinite(value) for value in values):
+        return "not_finite"
+    if isinstance(sample, PowerDemand) and abs(sample.power_w) > MAX_POWER_W:
+        return "demand_out_of_range"
+    return None

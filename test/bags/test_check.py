@@ -176,3 +176,23 @@ def test_first_difference_names_column_and_step(driven):
     )
     assert text.startswith("fuel_kg differs from step 7")
     assert first_difference(driven.trajectory, driven.trajectory) == "no difference"
+
+
+def test_a_complete_run_of_no_possible_cycle_gets_a_verdict(driven, write):
+    """Steps of ten minutes: the demand cannot be any duty cycle, least of all the announced."""
+    slow = []
+    for sample in driven.samples:
+        if isinstance(sample, RunInfo):
+            slow.append(dataclasses.replace(sample, dt_s=600.0))
+            continue
+        ticks = (sample.stamp_ns - driven.info.t0_ns) // driven.info.dt_ns
+        stamp_ns = driven.info.t0_ns + ticks * 600 * 10**9
+        slow.append(dataclasses.replace(sample, stamp_ns=stamp_ns))
+    report = check(write(slow))
+    assert report.verdict == "fail" and report.outcome("complete") == "pass"
+    assert report.outcome("cycle") == "fail"
+
+
+def test_a_demand_of_no_tractor_fails_the_values(driven, write):
+    report = check(write(changed(driven.samples, PowerDemand, 5, power_w=2e9)))
+    assert report.outcome("values") == "fail"

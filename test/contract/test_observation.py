@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from tractor_msgs_py.errors import PolicyError
 from tractor_msgs_py.observation import (
+    MAX_PENDING,
     DemandFilter,
     ObservationBuilder,
     ObservationSpec,
@@ -62,8 +63,8 @@ def test_a_repeated_tick_is_refused_and_counted():
         (1, {"soc": math.nan}, "soc_out_of_range"),
         (1, {"soc": 83.6}, "soc_out_of_range"),
         (2, {"engine_limit_w": math.nan}, "not_finite"),
-        (0, {"stamp_ns": 0}, "stamp_outside_run"),
-        (0, {"stamp_ns": 10**12 + 5}, "stamp_outside_run"),
+        (0, {"stamp_ns": 0}, "zero_stamp"),
+        (0, {"stamp_ns": 10**12 + 5}, "stamp_off_grid"),
         (0, {"stamp_ns": 10**15}, "stamp_outside_run"),
     ],
 )
@@ -125,3 +126,31 @@ def test_a_spec_survives_json_and_refuses_what_cannot_be_supplied():
     for change in ({"signals": ["wheel_slip"]}, {"mode": "sampled"}, {"filters": [{"kind": "x"}]}):
         with pytest.raises(PolicyError):
             ObservationSpec.from_json({**spec.to_json(), **change})
+
+
+REAL_TIME = dataclasses.replace(RUN, run_id="rt", lockstep=False, steps=10_000)
+
+
+def test_samples_that_never_find_their_partners_do_not_pile_up():
+    made = ObservationBuilder(ObservationSpec())
+    made.start_run(REAL_TIME)
+    for k in range(1000):
+        assert made.add(PowerDemand(REAL_TIME.stamp_ns(0) + k, 1e5)) is None
+    assert made.refusals["unjoined"] == 1000 - MAX_PENDING
+    newest = tick(0, run=dataclasses.replace(REAL_TIME, t0_ns=REAL_TIME.t0_ns + 999))
+    assert [made.add(s) for s in newest[1:]][-1] is not None
+
+
+@pytest.mark.parametrize("k", [-1, 10_001])
+def test_a_real_time_run_has_a_first_and_a_last_stamp_too(k):
+    made = ObservationBuilder(ObservationSpec())
+    made.start_run(REAL_TIME)
+    assert all(made.add(s) is None for s in tick(k, run=REAL_TIME))
+    assert made.refusals == {"stamp_outside_run": 3}
+    assert [made.add(s) for s in tick(10_000, run=REAL_TIME)][-1] is not None
+
+
+def test_a_demand_of_no_tractor_is_refused():
+    made = builder()
+    assert all(made.add(s) is None for s in tick(0, demand_w=-1.1e9))
+    assert made.refusals == {"demand_out_of_range": 1}

@@ -5,7 +5,7 @@ Pure grouping and joining of decoded samples; files are ``read``'s business.
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeAlias
@@ -13,7 +13,7 @@ from typing import TypeAlias
 import numpy as np
 
 from tractor_msgs_py.errors import BagError
-from tractor_msgs_py.observation import Observation, ObservationBuilder, ObservationSpec
+from tractor_msgs_py.observation import Observation, ObservationBuilder, ObservationSpec, refusal
 from tractor_msgs_py.trajectory import Trajectory
 from tractor_msgs_py.types import (
     BatteryPowerCommand,
@@ -53,18 +53,34 @@ class Run:
     refusals: Mapping[str, int]
 
     @cached_property
-    def stamps_ns(self) -> tuple[int, ...]:
-        """Stamps of the decisions: of the announced grid, or of the recorded demand."""
+    def stamps_ns(self) -> Sequence[int]:
+        """Stamps of the decisions: of the recorded demand, or of the announced grid.
+
+        The grid ends at the last recorded stamp: a run that stopped early has fewer stamps than
+        announced steps.
+        """
         if self.info is None or not self.info.lockstep:
             return tuple(self.demand)
-        return tuple(self.info.stamp_ns(k) for k in range(self.info.steps))
+        recorded = (self.demand, self.battery, self.powertrain, self.command)
+        last_ns = max((max(samples) for samples in recorded if samples), default=0)
+        end_ns = min(last_ns + 1, self.info.stamp_ns(self.info.steps))
+        return range(self.info.t0_ns, end_ns, self.info.dt_ns)
+
+    @cached_property
+    def ends_ns(self) -> Sequence[int]:
+        """Stamps of the states after the decisions."""
+        stamps = self.stamps_ns
+        if self.info is None or not stamps:
+            return stamps[1:]
+        if isinstance(stamps, range):
+            return range(stamps.start + stamps.step, stamps[-1] + stamps.step + 1, stamps.step)
+        return (*stamps[1:], self.info.stamp_ns(self.info.steps))
 
     @cached_property
     def driven(self) -> tuple[bool, ...]:
         """Per decision: demand, state before and after, and in lockstep the answer, are there."""
         if self.info is None:
             return (False,) * len(self.stamps_ns)
-        ends = (*self.stamps_ns[1:], self.info.stamp_ns(self.info.steps))
         return tuple(
             stamp in self.demand
             and stamp in self.battery
@@ -72,7 +88,7 @@ class Run:
             and end in self.battery
             and end in self.powertrain
             and (stamp in self.command or not self.info.lockstep)
-            for stamp, end in zip(self.stamps_ns, ends, strict=True)
+            for stamp, end in zip(self.stamps_ns, self.ends_ns, strict=True)
         )
 
     @property
@@ -105,7 +121,7 @@ def trajectory_of(run: Run) -> Trajectory:
     if not steps:
         raise BagError(f"run {run.info.run_id}: no step was driven")
     stamps = run.stamps_ns[:steps]
-    ends = (*run.stamps_ns[1:], run.info.stamp_ns(run.info.steps))[:steps]
+    ends = run.ends_ns[:steps]
     after = [run.powertrain[stamp] for stamp in ends]
     unanswered = BatteryPowerCommand(0, math.nan)
     commands = [run.command.get(stamp, unanswered) for stamp in stamps]
@@ -182,7 +198,7 @@ class _Draft:
             self.latest_ns[type(sample)] = sample.stamp_ns
         if isinstance(sample, BatteryPowerCommand) and sample.mode is not CommandMode.NOMINAL:
             return  # fallback and shutdown commands answer no tick
-        reason = _refusal(sample, self.info)
+        reason = refusal(sample, self.info)
         if reason is not None:
             self.refusals[reason] += 1
             return
@@ -275,34 +291,3 @@ class RunCollector:
         self.waiting = []
         for draft in self.drafts:
             yield draft.finish(self.namespace, policies)
-
-
-def _refusal(sample: StampedSample, info: RunInfo | None) -> str | None:
-    """Why a sample must not be used, or None."""
-    if sample.stamp_ns <= 0:
-        return "zero_stamp"
-    if info is not None and info.lockstep and (sample.stamp_ns - info.t0_ns) % info.dt_ns:
-        return "stamp_off_grid"
-    match sample:
-        case PowerDemand():
-            values: tuple[float, ...] = (sample.power_w,)
-        case BatteryReading():
-            if not 0.0 <= sample.soc <= 1.0:
-                return "soc_out_of_range"
-            values = ()
-        case BatteryPowerCommand():
-            values = ()  # whatever a policy answered is what the plant projected and applied
-        case PowertrainReading():
-            values = (
-                sample.time_in_state_s,
-                sample.engine_power_w,
-                sample.charge_limit_w,
-                sample.discharge_limit_w,
-                sample.engine_limit_w,
-                sample.applied_battery_power_w,
-                sample.applied_engine_power_w,
-                sample.fuel_kg,
-                sample.shortfall_j,
-                sample.dissipated_j,
-            )
-    return None if all(math.isfinite(value) for value in values) else "not_finite"

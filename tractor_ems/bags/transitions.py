@@ -215,11 +215,11 @@ _NONE: dict[str, NDArray[Any]] = {
 def _driven_traces(run: Run, bag: str, digest: str) -> list[Trace]:
     info = run.info
     assert info is not None
-    stamps = run.stamps_ns
+    stamps, ends = run.stamps_ns, run.ends_ns
     traces = []
     for first, last in _stretches(np.array(run.driven)):
         during = stamps[first:last]
-        after_last = info.stamp_ns(info.steps) if last == len(stamps) else stamps[last]
+        after_last = ends[last - 1]
         states = [run.powertrain[stamp] for stamp in (*during, after_last)]
         applied = states[1:]
         traces.append(
