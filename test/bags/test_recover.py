@@ -123,3 +123,40 @@ def test_part_that_holds_no_message_is_refused_and_kept(content, tmp_path):
 def test_missing_folder_is_refused(tmp_path):
     with pytest.raises(BagError, match="no such bag"):
         recover(tmp_path / "nothing")
+
+
+def test_a_recording_that_goes_on_is_left_alone(driven, tmp_path):
+    bag = tmp_path / "bag"
+    topic, message = encode(driven.samples[1], RosbagsMessages())
+    writer = BagWriter(bag, {f"/{topic.name}": topic}, {})
+    data = serialize(message, topic.type)
+    writer.write(f"/{topic.name}", data, 10, 10)
+    beside = bag / ".bag_0.mcap.1234.part"
+    beside.write_bytes(b"of a finalise that goes on")
+    for refused in (read_bag, recover, lambda bag: recover(bag / "bag_0.mcap.part")):
+        with pytest.raises(BagError, match="still being recorded") as caught:
+            refused(bag)
+        assert str(bag) in str(caught.value)
+    assert beside.exists()
+    beside.unlink()
+    writer.write(f"/{topic.name}", data, 11, 11)
+    assert writer.close().messages == {f"/{topic.name}": 2}
+    assert len(messages_of(bag)) == 2
+
+
+def test_the_recorder_holds_its_part_until_it_is_finalised(driven, tmp_path, monkeypatch):
+    bag = tmp_path / "bag"
+    topic, message = encode(driven.samples[1], RosbagsMessages())
+    writer = BagWriter(bag, {f"/{topic.name}": topic}, {})
+    writer.write(f"/{topic.name}", serialize(message, topic.type), 10, 10)
+    real, seen = finalise_module.write_bytes, []
+
+    def look(path, data):
+        with pytest.raises(BagError, match="still being recorded"):
+            recover(bag)
+        seen.append(path.name)
+        real(path, data)
+
+    monkeypatch.setattr(finalise_module, "write_bytes", look)
+    writer.close()
+    assert seen == ["metadata.yaml"]

@@ -23,7 +23,7 @@ from tractor_ems.bags.write import BagWriter
 from tractor_ems.policies.rules import BestPoint, Conventional, MyopicGreedy, RuleBased
 from tractor_ems.scenario import make_scenario
 from tractor_msgs_py import topics
-from tractor_msgs_py.errors import BagError
+from tractor_msgs_py.errors import BagError, RunAborted
 from tractor_msgs_py.observation import DemandFilter, ObservationSpec
 from tractor_msgs_py.trajectory import Trajectory, trajectory_hash
 from tractor_msgs_py.types import (
@@ -102,8 +102,10 @@ def test_full_disk_is_one_line_and_keeps_what_was_flushed(tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (writer.part.stat().st_size, hard))
     try:
-        with pytest.raises(BagError, match=r"bag_0\.mcap\.part: cannot be written"):
+        with pytest.raises(RunAborted, match=r"bag_0\.mcap\.part: cannot be written"):
             writer.write("/run_info", bytes(100_000), 2, 2)
+        with pytest.raises(RunAborted, match="cannot be written"):
+            writer.close()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert sum(recover(tmp_path / "bag").messages.values()) == 1

@@ -15,7 +15,7 @@ from typing import IO, Any
 
 import yaml
 from mcap.exceptions import McapError
-from mcap.records import Channel, McapRecord, Message, Metadata, Schema
+from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from mcap.well_known import Profile
 from mcap.writer import CompressionType, Writer
@@ -149,13 +149,15 @@ def _transcode(
 
 def _readable(source: IO[bytes], seen: _Transcript) -> Iterator[McapRecord]:
     """Records in file order until the end, a cut, or damage; each is accounted for in ``seen``."""
-    records = StreamReader(source, record_size_limit=MAX_RECORD_BYTES).records
+    records = StreamReader(source, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES).records
     while True:
         try:
             record = next(records)
         except (McapError, struct.error, ValueError, StopIteration):
             return
         match record:
+            case Chunk():
+                return  # a part has none: not a recording of ours from here on
             case Schema():
                 seen.schemas[record.id] = record
             case Channel():

@@ -10,12 +10,14 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 
+from tractor_ems.bags.chunk_limit import refuse_large_chunks
+from tractor_ems.bags.part_lock import refuse_live
+from tractor_ems.bags.plain_yaml import parse_yaml
 from tractor_ems.bags.rosbags_messages import deserialize, type_hash
 from tractor_ems.bags.runs import Run, RunCollector
 from tractor_msgs_py import topics
@@ -56,49 +58,56 @@ def storage_file(path: Path) -> Path:
     """The one storage file of a bag.
 
     Raises:
-        BagError: the bag is missing, was not finalised, or is spread over several files.
+        BagError: the bag is missing, is being recorded, was not finalised, or is spread over
+            several files.
     """
     if path.is_file():
         return path
     if not path.exists():
         raise BagError(f"{path}: no such bag")
-    if any(path.glob(PART_FILES)):
+    for part in path.glob(PART_FILES):
+        refuse_live(part)
         raise BagError(f"{path}: the recording was not finalised; run: ems bag recover {path}")
     files = sorted([*path.glob("*.mcap"), *path.glob("*.db3")])
     if len(files) != 1:
         raise BagError(f"{path}: {len(files)} storage files, expected one .mcap or .db3")
+    if not files[0].is_file():
+        raise BagError(f"{files[0]}: not a file that can be read")
     return files[0]
 
 
 def bag_hash(path: Path) -> str:
-    """SHA-256 of a bag's storage file, which names the bag in policy files and reports."""
-    digest = hashlib.sha256()
-    with storage_file(path).open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
+    """SHA-256 of a bag's storage file, which names the bag in policy files and reports.
+
+    Raises:
+        BagError: there is no such bag, or its file cannot be read.
+    """
+    digest, file = hashlib.sha256(), storage_file(path)
+    try:
+        with file.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
+    except OSError as error:
+        raise BagError(f"{path}: cannot be read ({error.strerror})") from None
     return digest.hexdigest()
 
 
 def provenance_of(path: Path) -> dict[str, str]:
-    """What the writer said about the bag: metadata.yaml's custom data, else the MCAP record.
+    """What the writer said about the bag: the MCAP record, which :func:`bag_hash` covers.
 
-    Empty for a bag of another writer.
+    metadata.yaml's custom data for a sqlite3 bag. Empty for a bag of another writer.
     """
-    metadata = path / "metadata.yaml"
+    file = storage_file(path)
+    metadata = _metadata(path, file)
     try:
-        if metadata.is_file():
-            document = yaml.safe_load(metadata.read_text(encoding="utf-8"))
-            data = document["rosbag2_bagfile_information"].get("custom_data") or {}
-            return {str(key): str(value) for key, value in data.items()}
-        file = storage_file(path)
         if file.suffix != ".mcap":
-            return {}
+            data = metadata.get("custom_data") or {}
+            return {str(key): str(value) for key, value in data.items()}
         with file.open("rb") as stream:
             records = make_reader(stream).iter_metadata()
             return dict(next((r.metadata for r in records if r.name == PROVENANCE), {}))
     except (
         OSError,
-        yaml.YAMLError,
         McapError,
         struct.error,
         ValueError,
@@ -107,6 +116,30 @@ def provenance_of(path: Path) -> dict[str, str]:
         AttributeError,
     ) as error:
         raise BagError(f"{path}: provenance cannot be read ({_brief(error)})") from None
+
+
+def _metadata(path: Path, file: Path) -> dict[str, Any]:
+    """metadata.yaml's content, which must be about ``file`` as it is; empty where there is none.
+
+    A file that it names instead would be read, and be no part of the bag's hash. What rosbag2
+    compressed on top of its storage has no limit to what it expands to.
+    """
+    metadata = path / "metadata.yaml"
+    if not metadata.is_file():
+        return {}
+    try:
+        text = metadata.read_text(encoding="utf-8")
+        document = parse_yaml(text, f"{path}: provenance cannot be read")
+        content: dict[str, Any] = document["rosbag2_bagfile_information"]
+        named = [str(name) for name in content["relative_file_paths"]]
+        mode = str(content.get("compression_mode") or "").lower()
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise BagError(f"{path}: provenance cannot be read ({_brief(error)})") from None
+    if [Path(name).name for name in named] != [file.name]:
+        raise BagError(f"{path}: metadata.yaml names {named}, expected [{file.name!r}]")
+    if mode not in ("", "none"):
+        raise BagError(f"{path}: compression_mode {mode!r}, allowed none (chunks may be)")
+    return content
 
 
 def read_bag(path: Path) -> list[Run]:
@@ -119,7 +152,6 @@ def read_bag(path: Path) -> list[Run]:
             type or type hash, or a message has another layout.
     """
     file = storage_file(path)
-    policies = provenance_of(path)
     collectors: dict[str, RunCollector] = {}
     for namespace, name, data in _messages(path, file):
         collector = collectors.setdefault(namespace, RunCollector(namespace))
@@ -127,6 +159,7 @@ def read_bag(path: Path) -> list[Run]:
             collector.add(decode(name, data))
         except BagError as error:
             raise BagError(f"{path}: {name}: {error}") from None
+    policies = provenance_of(path)
     runs = [run for c in collectors.values() for run in c.runs(policies)]
     if not any(run.demand for run in runs):
         raise BagError(f"{path}: holds no {topics.POWER_DEMAND.name}")
@@ -146,7 +179,9 @@ def decode(name: str, data: bytes) -> Sample:
 
 def _messages(path: Path, file: Path) -> Iterator[tuple[str, str, bytes]]:
     """Namespace, relative topic name and CDR bytes of the contract's messages."""
-    whole = path if (path / "metadata.yaml").is_file() else file
+    whole = path if _metadata(path, file) else file
+    if file.suffix == ".mcap":
+        refuse_large_chunks(file)
     try:
         with Reader(whole) as reader:
             wanted = _contract_connections(path, reader.connections)

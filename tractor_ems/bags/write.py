@@ -7,7 +7,7 @@ is finalised (``finalise``), by the same code after a clean stop and after a cra
 
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 
@@ -16,11 +16,12 @@ from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
 from mcap.writer import CompressionType, IndexType, Writer
 
 from tractor_ems.bags.finalise import Finalised, finalise
+from tractor_ems.bags.part_lock import hold
 from tractor_ems.bags.read import PART_SUFFIX, PROVENANCE
 from tractor_ems.bags.rosbags_messages import definition, type_hash
 from tractor_msgs_py import __version__
 from tractor_msgs_py.atomic import sync_folder
-from tractor_msgs_py.errors import BagError
+from tractor_msgs_py.errors import BagError, RunAborted, TractorEmsError
 from tractor_msgs_py.topics import Qos, Topic
 
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}
@@ -47,7 +48,7 @@ class BagWriter:
     """Records raw CDR messages into a new bag folder.
 
     Use as a context manager, or call :meth:`close`. A writer that is abandoned leaves its part
-    file, which ``recover`` finalises.
+    file, which ``recover`` finalises. While it lives it holds the part file's lock.
 
     Args:
         folder: the bag to create; parents are created too.
@@ -73,8 +74,9 @@ class BagWriter:
             raise BagError(f"{folder}: exists already, a recording overwrites nothing") from None
         except OSError as error:
             raise BagError(f"{folder}: cannot be created ({error.strerror})") from None
-        with self._writing():
+        with self._writing(BagError):
             self._file = self.part.open("xb")
+            hold(self._file)
             self._writer = Writer(
                 self._file,
                 compression=CompressionType.NONE,
@@ -83,18 +85,20 @@ class BagWriter:
             )
             self._writer.start(profile=Profile.ROS2, library=f"tractor_ems {__version__}")
             self._channels = {name: self._register(name, channels[name]) for name in channels}
-            self.note({"package_version": __version__, **provenance})
-            self.sync()
+            self._writer.add_metadata(PROVENANCE, {"package_version": __version__, **provenance})
+            self._file.flush()
+            os.fsync(self._file.fileno())
             sync_folder(folder)
             sync_folder(folder.parent)
 
     @contextmanager
-    def _writing(self) -> Iterator[None]:
+    def _writing(self, kind: type[TractorEmsError] = RunAborted) -> Iterator[None]:
+        """A failure to begin is a bad folder; one after that ends a run that was going on."""
         try:
             yield
         except OSError as error:
             reason = error.strerror or str(error)
-            raise BagError(f"{self.part}: cannot be written ({reason})") from None
+            raise kind(f"{self.part}: cannot be written ({reason})") from None
 
     def _register(self, name: str, topic: Topic) -> int:
         if topic.type not in self._schemas:
@@ -121,7 +125,7 @@ class BagWriter:
             sequence: the publisher's sequence number, 0 where unknown.
 
         Raises:
-            BagError: the file cannot be written, for instance because the disk is full.
+            RunAborted: the file cannot be written, for instance because the disk is full.
         """
         with self._writing():
             self._writer.add_message(
@@ -150,17 +154,30 @@ class BagWriter:
         """Finalise the bag.
 
         Raises:
-            BagError: it cannot be written; the part file stays and ``recover`` tries again.
+            BagError: nothing was written into it.
+            RunAborted: it cannot be finalised.
+                The part file stays either way, and ``recover`` tries again.
         """
-        self.sync()
-        self._file.close()
-        return finalise(self.part, recovered=False)
+        try:
+            self.sync()
+            return finalise(self.part, recovered=False)
+        except BagError as error:
+            if not self.messages:
+                raise
+            raise RunAborted(str(error)) from None
+        finally:
+            self._release()
 
     def discard(self) -> None:
         """Remove a recording that holds nothing worth keeping."""
-        self._file.close()
+        self._release()
         self.part.unlink(missing_ok=True)
         self.folder.rmdir()
+
+    def _release(self) -> None:
+        """Close the file, and with it the lock; what a full disk did not take is given up."""
+        with suppress(OSError):
+            self._file.close()
 
     def __enter__(self) -> "BagWriter":
         return self
@@ -174,4 +191,4 @@ class BagWriter:
         if error is None:
             self.close()
         else:
-            self._file.close()
+            self._release()

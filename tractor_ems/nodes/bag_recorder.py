@@ -5,7 +5,6 @@ either way. A recorder that received nothing removes what it had begun. After SI
 holds a part file: ``ems bag recover``.
 """
 
-import shlex
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -20,7 +19,8 @@ from rclpy.node import Node
 from tractor_ems.bags.progress import Progress
 from tractor_ems.bags.write import BagWriter
 from tractor_msgs_py import topics
-from tractor_msgs_py.errors import BagError, RunAborted
+from tractor_msgs_py.errors import RunAborted, TractorEmsError
+from tractor_msgs_py.provenance import command_line
 from tractor_msgs_py.ros.messages import CLASSES
 from tractor_msgs_py.ros.shell import Parameter, qos_profile, run_node
 
@@ -65,7 +65,7 @@ class BagRecorder:
                 CLASSES[topic.type], name, self._receiver(name, topic), qos_profile(qos), raw=True
             )
         node.create_timer(SYNC_S, self._sync, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        provenance = {"recorder": "bag_recorder", "recorder_command_line": shlex.join(sys.argv)}
+        provenance = {"recorder": "bag_recorder", "recorder_command_line": command_line()}
         output = values["output"] or time.strftime("tractor_ems_%Y_%m_%d-%H_%M_%S")
         self._writer = BagWriter(Path(output), channels, provenance)
 
@@ -131,7 +131,7 @@ class BagRecorder:
         """Finalise what is there."""
         try:
             self._close()
-        except BagError as error:
+        except TractorEmsError as error:
             print(f"bag_recorder: {error}", file=sys.stderr)
             raise SystemExit(error.exit_code) from None
 
