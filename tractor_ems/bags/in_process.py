@@ -1,7 +1,8 @@
 """In-process runs as bags: the plant's and the policy's samples through the same codec, writer
 and finaliser as a recording of the nodes, without ROS.
 
-Equal runs give equal bytes: times are the stamps, and the run id follows from the content.
+Equal runs of one command line give equal bytes: times are the stamps, and the run id follows
+from the content.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,6 +16,7 @@ from tractor_ems.scenario import Scenario
 from tractor_msgs_py import __version__, topics
 from tractor_msgs_py.codec import encode
 from tractor_msgs_py.errors import BagError
+from tractor_msgs_py.provenance import command_line
 from tractor_msgs_py.trajectory import FloatArray, IntArray, Trajectory, trajectory_hash
 from tractor_msgs_py.types import BatteryPowerCommand, PowerDemand, RunInfo, Sample
 from tractor_sim.duty_cycle.cycle import cycle_hash
@@ -23,13 +25,14 @@ from tractor_sim.powertrain import PowertrainParams
 from tractor_sim.powertrain_json import powertrain_hash
 
 
-def record_in_process(
-    policy: Policy, scenario: Scenario, out: Path, command_line: str = ""
-) -> Trajectory:
+def record_in_process(policy: Policy, scenario: Scenario, out: Path) -> Trajectory:
     """Drive ``policy`` over ``scenario`` and record the run into the new bag ``out``.
 
+    The bag names the command line of this process.
+
     Raises:
-        BagError: ``out`` exists already or cannot be written.
+        BagError: ``out`` exists already or cannot be created.
+        RunAborted: writing it failed midway.
         PolicyError: the policy was made for another step length.
     """
     trajectory = drive(
@@ -39,7 +42,7 @@ def record_in_process(
         scenario.soc_initial,
         scenario.soc_target,
     )[0]
-    info = run_info_of(scenario, trajectory, policy.name, command_line)
+    info = run_info_of(scenario, trajectory, policy.name, command_line())
     write_trajectory_bag(out, scenario.params, info, trajectory, policy.name)
     return trajectory
 

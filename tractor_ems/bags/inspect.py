@@ -3,12 +3,10 @@
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from tractor_ems.bags.plain_yaml import parse_yaml
 from tractor_ems.bags.read import bag_hash, provenance_of, read_bag, storage_file
 from tractor_ems.bags.runs import Run, trajectory_of
 from tractor_ems.bags.scan import scan_mcap
-from tractor_msgs_py.errors import BagError
 from tractor_msgs_py.trajectory import trajectory_hash
 
 
@@ -80,7 +78,4 @@ def run_json(run: Run) -> dict[str, Any]:
 
 
 def _plain_qos(text: str) -> Any:
-    try:
-        return yaml.safe_load(text) or []
-    except yaml.YAMLError as error:
-        raise BagError(f"offered_qos_profiles: {' '.join(str(error).split())}") from None
+    return parse_yaml(text, "offered_qos_profiles") or []

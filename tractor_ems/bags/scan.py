@@ -14,6 +14,7 @@ from mcap.exceptions import McapError
 from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
+from tractor_ems.bags.chunk_limit import refuse_large_chunks
 from tractor_msgs_py.errors import BagError
 
 MAGIC_BYTES = 8
@@ -77,6 +78,7 @@ def scan_mcap(file: Path) -> Scan:
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     sequences: dict[int, list[int]] = defaultdict(list)
+    refuse_large_chunks(file)
     try:
         with file.open("rb") as stream:
             _validate_summary(stream)
