@@ -10,7 +10,8 @@ import yaml
 from tractor_msgs_py.errors import ConfigError
 
 MAX_BYTES = 1_000_000
-"""No settings file is larger; nested to any depth, one of this size still parses quickly."""
+MAX_DEPTH = 32
+"""No settings file is larger, or nested deeper: the parser recurses, and takes quadratic time."""
 
 
 def read_yaml(path: Path) -> Any:
@@ -20,8 +21,8 @@ def read_yaml(path: Path) -> Any:
     no settings file needs one.
 
     Raises:
-        ConfigError: the file cannot be read, is too large, is not YAML, holds an alias, or a
-            value that Python cannot hold (a date 2023-13-01, a number of 5000 digits).
+        ConfigError: the file cannot be read, is too large or nested too deeply, is not YAML,
+            holds an alias, or a value that Python cannot (a date 2023-13-01, 5000 digits).
     """
     try:
         with path.open("rb") as file:
@@ -32,14 +33,17 @@ def read_yaml(path: Path) -> Any:
     if len(raw) > MAX_BYTES:
         raise ConfigError(f"{path}: more than the {MAX_BYTES} bytes a settings file may have")
     try:
+        depth = 0
         for event in yaml.parse(text, Loader=yaml.SafeLoader):
+            depth += isinstance(event, yaml.CollectionStartEvent)
+            depth -= isinstance(event, yaml.CollectionEndEvent)
+            if depth > MAX_DEPTH:
+                raise ConfigError(f"{path}: nested more than {MAX_DEPTH} deep")
             if isinstance(event, yaml.AliasEvent):
                 raise ConfigError(f"{path}: alias *{event.anchor}, no aliases are allowed")
         return yaml.safe_load(text)
     except yaml.YAMLError as error:
         raise ConfigError(f"{path}: not YAML ({' '.join(str(error).split())})") from None
-    except RecursionError:
-        raise ConfigError(f"{path}: not YAML (nested too deeply)") from None
     except (ValueError, OverflowError, TypeError) as error:
         reason = " ".join(str(error).split())
         raise ConfigError(f"{path}: holds a value that cannot be read ({reason})") from None

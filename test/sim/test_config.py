@@ -89,7 +89,7 @@ NOT_SETTINGS = {
     "a month 13": ("name: 2023-13-01", "cannot be read"),
     "too many digits": (f"dt_s: {'9' * 5000}", "cannot be read"),
     "too many hexadecimal digits": (f"seed: 0x{'f' * 9000}", "thousands of digits"),
-    "deep nesting": ("name: " + "[" * 5000, "not YAML"),
+    "deep nesting": ("name: " + "[" * 5000, "nested more than 32 deep"),
     "nested aliases": (
         "a: &a [1]\n"
         + "".join(f"{b}: &{b} [{f'*{a}, ' * 9}]\n" for a, b in pairwise("abcdefghi")),
