@@ -120,6 +120,31 @@ def test_sigterm_leaves_a_checkpoint_and_exits_0(
     assert "Traceback" not in log.read_text()
 
 
+def test_sigterm_exits_2_where_the_checkpoint_cannot_be_written(
+    bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    out, log, preset = tmp_path / "p.safetensors", tmp_path / "log", tmp_path / "preset.yaml"
+    preset.write_text("checkpoint_every: 100000000\n")
+    checkpoint_path(out).mkdir()
+    given = {
+        "bags": f"['{bags / 'best'}']",
+        "output": str(out),
+        "updates": "100000000",
+        "preset": str(preset),
+    }
+    with (
+        domain_id() as domain,
+        progress(domain, monkeypatch) as look,
+        trainer(domain, log, **given) as process,
+    ):
+        wait_for(lambda: any(p["step"] > 0 for p in look()), "the first updates")
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(DEADLINE_S) == 2, log.read_text()
+    last = log.read_text().splitlines()[-1]
+    assert last.startswith("trainer: ") and str(checkpoint_path(out)) in last
+    assert "Traceback" not in log.read_text()
+
+
 @pytest.mark.parametrize(
     ("parameters", "named"),
     [

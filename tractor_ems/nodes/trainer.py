@@ -4,7 +4,6 @@ SIGINT and SIGTERM leave a checkpoint that ``resume`` continues. Learning itself
 """
 
 import json
-import shlex
 import sys
 import threading
 from collections.abc import Mapping
@@ -20,7 +19,7 @@ from std_msgs.msg import String
 from tractor_ems.learning.config import load_train_config
 from tractor_ems.learning.rewards import RewardKind
 from tractor_ems.learning.train import TrainReport, train
-from tractor_msgs_py.errors import ConfigError
+from tractor_msgs_py.errors import ConfigError, TractorEmsError
 from tractor_msgs_py.ros.shell import Parameter, qos_profile, run_node
 from tractor_msgs_py.topics import Qos
 
@@ -43,6 +42,7 @@ PARAMETERS = (
         "rule_share", -1.0, "replay share from rule-based bags, -1: the preset's", "", -1.0, 1.0
     ),
     Parameter("allow_other_powertrain", False, "learn from bags of another powertrain"),
+    Parameter("allow_held_out", False, "learn from bags of held-out cycles"),
     Parameter("resume", False, "go on from the checkpoint beside the output"),
 )
 
@@ -78,7 +78,6 @@ class Trainer:
                     progress=self._note,
                     stop=self._stop.is_set,
                     resume=values["resume"],
-                    command_line=shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
                 )
             except BaseException as error:
                 self._error = error
@@ -98,14 +97,20 @@ class Trainer:
         if self._worker.is_alive():
             return None
         self._worker.join()
-        if self._error is not None:
-            raise self._error
+        self._raise_error()
         return 0
 
+    def _raise_error(self) -> None:
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
     def shutdown(self) -> None:
-        """Stop after the present update, which leaves a checkpoint; say how it ended."""
+        """Stop after the present update, which leaves a checkpoint; say how it ended, or raise
+        what ended it: a checkpoint that was not written must not look like one that was."""
         self._stop.set()
         self._worker.join()
+        self._raise_error()
         if self._report is not None:
             state = "done" if self._report.policy else "stopped"
             self._latest = {**self._latest, "state": state, "step": self._report.updates}
@@ -126,12 +131,17 @@ def _overrides(values: Mapping[str, Any]) -> dict[str, Any]:
         "interact": None if values["interact"] < 0 else values["interact"],
         "sampled.rule_share": None if values["rule_share"] < 0 else values["rule_share"],
         "allow_other_powertrain": values["allow_other_powertrain"] or None,
+        "allow_held_out": values["allow_held_out"] or None,
     }
 
 
 def main() -> int:
     """Entry point."""
-    return run_node("trainer", PARAMETERS, Trainer)
+    try:
+        return run_node("trainer", PARAMETERS, Trainer)
+    except TractorEmsError as error:  # from the shutdown, after run_node has its exit code
+        print(f"trainer: {' '.join(str(error).split())}", file=sys.stderr)
+        return error.exit_code
 
 
 if __name__ == "__main__":
