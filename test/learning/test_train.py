@@ -1,6 +1,7 @@
 """Training runs from bags: repeatable and resumable to the byte, and clear about bad input."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -9,14 +10,16 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 
 from tractor_ems.learning.checkpoint import checkpoint_path
 from tractor_ems.learning.config import TrainConfig, learning_rate, load_train_config
-from tractor_ems.learning.recordings import Recordings
+from tractor_ems.learning.counterfactual import CounterfactualLearner
+from tractor_ems.learning.recordings import Recordings, read_recordings
 from tractor_ems.learning.train import train, train_on
 from tractor_ems.policies.q_policy import load_policy
-from tractor_msgs_py.errors import BagError, ConfigError
+from tractor_msgs_py.errors import BagError, ConfigError, RunAborted
 from tractor_sim.config import load_powertrain
 from tractor_sim.duty_cycle.library import cycle_names
 from tractor_sim.powertrain_json import powertrain_hash
@@ -39,6 +42,7 @@ CONFIGS = {
         },
     ),
 }
+NAN = float("nan")
 MODES = pytest.mark.parametrize("mode", CONFIGS)
 
 RESUME = """
@@ -109,12 +113,115 @@ def test_ctrl_c_waits_for_the_update_and_leaves_a_checkpoint(bags: Path, tmp_pat
             signal.raise_signal(signal.SIGINT)
 
     with pytest.raises(KeyboardInterrupt):
-        train(config, [bags / "best"], [], out, progress=interrupt)
+        train(config, [bags / "best"], [], out, progress=interrupt, command_line="x")
     assert checkpoint_path(out).is_file() and not out.exists()
-    train(config, [bags / "best"], [], out, resume=True, command_line="x")
+    train(config, [bags / "best"], [], out, resume=True, command_line="x --resume")
     assert out.read_bytes() == whole.read_bytes()
     steps = [json.loads(line)["step"] for line in (tmp_path / "p.jsonl").read_text().splitlines()]
     assert steps == [100, 200, 300, 400, 500]
+
+
+def test_a_run_killed_before_its_policy_was_written_resumes_to_the_same_bytes(
+    bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The last checkpoint may hold the last update: its loss is known to nothing else."""
+    config = replace(CONFIGS["counterfactual"], checkpoint_every=20)
+    whole, out = tmp_path / "whole.safetensors", tmp_path / "p.safetensors"
+    train(config, [bags / "best"], [], whole, command_line="x")
+
+    def killed(*_: object) -> None:
+        raise InterruptedError
+
+    with monkeypatch.context() as patch:
+        patch.setattr("tractor_ems.learning.train.save_policy", killed)
+        with pytest.raises(InterruptedError):
+            train(config, [bags / "best"], [], out, command_line="x")
+    train(config, [bags / "best"], [], out, resume=True, command_line="x --resume")
+    assert out.read_bytes() == whole.read_bytes()
+    assert load_policy(out).metadata["training"]["final_td_loss"] is not None
+
+
+@pytest.mark.parametrize("every", [1, 10_000])
+def test_a_diverged_run_is_aborted_before_it_can_be_saved(every: int, bags: Path, tmp_path: Path):
+    config = replace(CONFIGS["counterfactual"], checkpoint_every=every)
+    out = tmp_path / "p.safetensors"
+    with pytest.MonkeyPatch.context() as patch:
+        update = CounterfactualLearner.update
+
+        def diverge(learner: CounterfactualLearner):
+            metrics = update(learner)
+            return metrics if learner.step < 7 else metrics | {"losses/td_loss": torch.tensor(NAN)}
+
+        patch.setattr(CounterfactualLearner, "update", diverge)
+        with pytest.raises(RunAborted, match="diverged at update 7: loss is nan"):
+            train(config, [bags / "best"], [], out)
+    assert not out.exists()
+    assert checkpoint_path(out).exists() == (every == 1)
+
+
+def test_weights_that_are_not_finite_reach_no_checkpoint(
+    bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The loss of an update is that before its step, so the step can break what it praised."""
+    update = CounterfactualLearner.update
+
+    def poison(learner: CounterfactualLearner):
+        metrics = update(learner)
+        with torch.no_grad():
+            learner.online.parameters()[0].fill_(NAN)
+        return metrics
+
+    monkeypatch.setattr(CounterfactualLearner, "update", poison)
+    out = tmp_path / "p.safetensors"
+    with pytest.raises(RunAborted, match="diverged at update 1"):
+        run("counterfactual", bags, out, stop=lambda: True)
+    assert not checkpoint_path(out).exists()
+
+
+def test_the_size_of_a_spike_of_demand_changes_no_weight(make_traces, paper, tmp_path: Path):
+    quiet = make_traces([25], steps=200)[0]
+
+    def network(spike_w: float, mode: str) -> bytes:
+        demand_w = quiet.power_demand_w.copy()
+        demand_w[50] = spike_w
+        recordings = Recordings(dp=(replace(quiet, power_demand_w=demand_w),), rule=())
+        out = tmp_path / "p.safetensors"
+        config = replace(CONFIGS[mode], interact=0)
+        train_on(config, paper, recordings, out)
+        return load_policy(out).net.weights[0].tobytes()
+
+    for mode in CONFIGS:
+        assert network(1e14, mode) == network(1e9, mode)
+        assert network(-1e14, mode) == network(-1e9, mode)
+
+
+def test_the_order_and_names_of_bags_decide_nothing(bags: Path, tmp_path: Path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    for source, first, second in (("best", "a/1", "b/2"), ("rule", "a/2", "b/1")):
+        shutil.copytree(bags / source, tmp_path / first)
+        shutil.copytree(bags / source, tmp_path / second)
+    config = replace(CONFIGS["sampled"], sampled=replace(CONFIGS["sampled"].sampled, dp_share=0.5))
+    files = []
+    for name in ("a", "b"):
+        out = tmp_path / f"{name}.safetensors"
+        given = sorted((tmp_path / name).iterdir())
+        paper = load_powertrain("paper")
+        read = read_recordings(given, [], paper)
+        swapped = read_recordings(given[::-1], [], paper)
+        assert [t.bag_hash for t in read.traces] == [t.bag_hash for t in swapped.traces]
+        train(config, given, [], out, command_line="x")
+        files.append(out.read_bytes())
+    assert files[0] == files[1]
+
+
+def test_an_output_that_is_no_policy_file_is_refused_before_training(bags: Path, tmp_path: Path):
+    folder = tmp_path / "folder.safetensors"
+    folder.mkdir()
+    for out in (tmp_path / "policy", tmp_path, folder):
+        with pytest.raises(ConfigError, match=str(out)):
+            run("counterfactual", bags, out)
+    assert [path.name for path in tmp_path.iterdir()] == ["folder.safetensors"]
 
 
 def test_a_policy_file_says_where_it_came_from(bags: Path, tmp_path: Path):
@@ -221,7 +328,7 @@ def test_a_checkpoint_of_another_run_is_refused_by_what_differs(bags: Path, tmp_
     other = replace(CONFIGS["counterfactual"], seed=9)
     with pytest.raises(ConfigError, match="config differs"):
         train(other, [bags / "best"], [bags / "rule"], out, resume=True)
-    with pytest.raises(ConfigError, match="bag_hashes differs"):
+    with pytest.raises(ConfigError, match="rule_bag_hashes differs"):
         train(CONFIGS["counterfactual"], [bags / "best"], [], out, resume=True)
 
 

@@ -1,7 +1,5 @@
 """``ems train``: learn offline from bags."""
 
-import shlex
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -38,7 +36,10 @@ def train(
         float | None, typer.Option(help="Share of the replay buffer seeded from rule-based bags.")
     ] = None,
     allow_other_powertrain: Annotated[
-        bool, typer.Option(help="Learn from bags recorded on another powertrain.")
+        bool, typer.Option(help="Learn from the demand in bags recorded on another powertrain.")
+    ] = False,
+    allow_held_out: Annotated[
+        bool, typer.Option(help="Learn from bags of held-out cycles; scores on those then lie.")
     ] = False,
     resume: Annotated[
         bool, typer.Option(help="Go on from an interrupted run's checkpoint.")
@@ -63,6 +64,7 @@ def train(
         "interact": interact,
         "sampled.rule_share": rule_share,
         "allow_other_powertrain": True if allow_other_powertrain else None,
+        "allow_held_out": True if allow_held_out else None,
     }
     config = load_train_config(preset or targets, overrides)
     with Progress(
@@ -91,7 +93,6 @@ def train(
             progress=show,
             resume=resume,
             tensorboard=tensorboard,
-            command_line=shlex.join(["ems", *sys.argv[1:]]),
         )
     if json:
         print_json(report.to_json())

@@ -15,7 +15,7 @@ from safetensors.numpy import save
 from tractor_msgs_py.atomic import write_bytes
 from tractor_msgs_py.errors import ConfigError
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 _KEY = "tractor_ems.checkpoint"
 
 
@@ -63,10 +63,12 @@ def load_checkpoint(
     try:
         data = json.loads(document or "")
         version, state, stored = data["format_version"], data["state"], data["run"]
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         raise ConfigError(f"{path}: not a checkpoint of this package") from None
     if version != FORMAT_VERSION:
-        raise ConfigError(f"{path}: checkpoint version {version!r}, this package reads 1")
+        raise ConfigError(
+            f"{path}: checkpoint version {version!r}, this package reads {FORMAT_VERSION}"
+        )
     wanted = json.loads(json.dumps(run))
     for name in sorted({*wanted, *stored}):
         if wanted.get(name) != stored.get(name):

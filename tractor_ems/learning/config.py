@@ -22,7 +22,9 @@ Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Discount = Annotated[float, Field(ge=0.0, lt=1.0)]
 Rate = Annotated[float, Field(gt=0.0, le=1.0)]
 Seconds = Annotated[float, Field(gt=0.0, le=86_400.0)]
-Widths = Annotated[tuple[Annotated[int, Field(ge=1, le=4096)], ...], Field(min_length=1)]
+Widths = Annotated[
+    tuple[Annotated[int, Field(ge=1, le=4096)], ...], Field(min_length=1, max_length=15)
+]
 ActivationName = Literal["relu", "tanh"]
 LossName = Literal["huber", "mse"]
 
@@ -111,7 +113,9 @@ class TrainConfig:
             recorded step) or ``sampled`` (replayed transitions).
         reward: see ``rewards.RewardConfig``.
         powertrain: shipped name or YAML file.
-        allow_other_powertrain: use bags recorded on another powertrain.
+        allow_other_powertrain: use bags recorded on another powertrain; of their demand only, so
+            only with ``counterfactual``.
+        allow_held_out: use bags of held-out cycles, which makes any score on those worthless.
         seed: of every generator.
         actions: size of the battery-power grid; 1600 is the paper's.
         interact: simulated episodes to add.
@@ -124,6 +128,7 @@ class TrainConfig:
     reward: RewardConfig = RewardConfig()
     powertrain: str = "paper"
     allow_other_powertrain: bool = False
+    allow_held_out: bool = False
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     actions: Annotated[int, Field(ge=2, le=30_000)] = 1600
     interact: Annotated[int, Field(ge=0, le=1_000_000)] = 0
@@ -132,6 +137,13 @@ class TrainConfig:
     counterfactual: CounterfactualConfig = CounterfactualConfig()
     sampled: SampledConfig = SampledConfig()
     checkpoint_every: Count = 1000
+
+    def __post_init__(self) -> None:
+        if self.allow_other_powertrain and self.targets == "sampled":
+            raise ConfigError(
+                "allow_other_powertrain: true with targets sampled, which would replay what "
+                "another plant did; allowed with targets counterfactual"
+            )
 
     @property
     def updates(self) -> int:

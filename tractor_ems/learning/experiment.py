@@ -21,7 +21,12 @@ from tractor_ems.learning.replay import (
     draw_seeds,
 )
 from tractor_ems.learning.rewards import RewardConfig, resolve
-from tractor_ems.learning.samples import demand_samples, demand_scaling, observation_spec
+from tractor_ems.learning.samples import (
+    demand_samples,
+    demand_scaling,
+    observation_spec,
+    servable_demand_w,
+)
 from tractor_ems.policies.mlp import Mlp
 from tractor_ems.policies.q_policy import Normalisation, QPolicy
 from tractor_msgs_py.errors import ConfigError
@@ -38,7 +43,7 @@ class Experiment:
         config, params: settings and powertrain.
         reward: resolved.
         recordings: what the bags hold.
-        demands_w: every demand series to learn from, once each.
+        demands_w: every demand series to learn from, once each, cut to what can be served.
         episodes: names of the cycles to simulate, in order.
         spec, scaling: what the policy sees, and how it enters the network.
     """
@@ -101,7 +106,8 @@ def prepare(
         raise ConfigError("training: no bags given and interact is 0, there is nothing to learn")
     episodes = tuple(episode_cycles(config.interact, rng))
     simulated = [training_demand_w(name, params) for name in sorted(set(episodes))]
-    demands = [*distinct_demands(recordings.traces), *simulated]
+    recorded = distinct_demands(recordings.traces)
+    demands = [servable_demand_w(params, demand_w) for demand_w in (*recorded, *simulated)]
     scaling = demand_scaling(demands)
     return Experiment(
         config=config,
@@ -161,8 +167,8 @@ class SampledRun:
         replay.add(seeds)
         if not len(replay) and not config.interact:
             raise ConfigError(
-                "targets sampled: the bags hold no driven run to seed the replay from (demand-only"
-                " bags serve targets counterfactual)"
+                "targets sampled: the bags hold no driven run from its start on to seed the replay"
+                " from (demand-only bags serve targets counterfactual)"
             )
         self.learner = SampledLearner(
             inputs, config.actions, config.sampled, replay, generators.init, generators.sample

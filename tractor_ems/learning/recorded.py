@@ -7,6 +7,7 @@ import numpy as np
 from tractor_ems.bags.transitions import Trace
 from tractor_ems.learning.replay import Transitions
 from tractor_ems.learning.rewards import RewardConfig, step_reward
+from tractor_ems.learning.samples import servable_demand_w
 from tractor_ems.policies.action_grid import applied_index, feasible_range
 from tractor_ems.policies.q_policy import Normalisation, demand_inputs, soc_input, state_inputs
 from tractor_msgs_py.observation import ObservationSpec, filter_trace
@@ -35,9 +36,11 @@ class Drive:
 
 
 def drive_of_trace(trace: Trace) -> Drive | None:
-    """What a bag recorded; None for a demand-only trace or one without a target SOC."""
+    """What a bag recorded; None for a demand-only trace, one without a target SOC, and one that
+    begins within its run: what the demand filters showed by then is not known."""
     if (
-        trace.soc is None
+        not trace.from_start
+        or trace.soc is None
         or trace.engine_on is None
         or trace.time_in_state_s is None
         or trace.battery_power_w is None
@@ -95,7 +98,7 @@ def replay_transitions(
     from what was applied.
     """
     grid_w = battery_power_grid_w(params, actions)
-    demand_w, on = drive.power_demand_w, drive.engine_on
+    demand_w, on = servable_demand_w(params, drive.power_demand_w), drive.engine_on
     soc, target = drive.soc[:-1], np.full(len(demand_w), drive.soc_target)
     before_w = np.concatenate(
         (np.where(on[:1], drive.engine_power_w[:1], 0.0), drive.engine_power_w[:-1])

@@ -1,7 +1,8 @@
 """Which recordings a training run learns from: read, checked, sorted by who drove."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,8 @@ import numpy as np
 from tractor_ems.bags.transitions import Trace, iter_traces
 from tractor_msgs_py.errors import BagError
 from tractor_msgs_py.trajectory import FloatArray
+from tractor_sim.duty_cycle.cycle import cycle_hash
+from tractor_sim.duty_cycle.library import cycle_names, load_cycle
 from tractor_sim.powertrain import PowertrainParams
 from tractor_sim.powertrain_json import powertrain_hash
 
@@ -39,6 +42,14 @@ class Recordings:
         return sorted({trace.bag_hash for trace in self.traces if trace.bag_hash})
 
     @property
+    def identity(self) -> dict[str, list[str]]:
+        """What must be equal for a run to be resumed: who counts as expert is part of it."""
+        return {
+            "dp_bag_hashes": sorted({trace.bag_hash for trace in self.dp}),
+            "rule_bag_hashes": sorted({trace.bag_hash for trace in self.rule}),
+        }
+
+    @property
     def cycle_hashes(self) -> list[str]:
         """SHA-256 of every duty cycle that is known, sorted."""
         return sorted({trace.cycle_hash for trace in self.traces if trace.cycle_hash})
@@ -55,21 +66,40 @@ def read_recordings(
     params: PowertrainParams,
     *,
     allow_other_powertrain: bool = False,
+    allow_held_out: bool = False,
 ) -> Recordings:
     """Read and check every bag at or below the given paths.
 
+    Traces are in an order of their own, by bag hash, run and time: the names and the order of the
+    bags decide nothing.
+
     Raises:
-        BagError: a bag cannot be read, steps by another time, or was recorded on another
-            powertrain (unless that is allowed).
+        BagError: a bag cannot be read, steps by another time, was recorded on another powertrain
+            or on a held-out cycle (unless those are allowed).
     """
     given = iter_traces(bags) if bags else []
     rule = iter_traces(rule_bags) if rule_bags else []
     for trace in (*given, *rule):
         check_trace(trace, params, allow_other_powertrain=allow_other_powertrain)
+        if not allow_held_out and trace.cycle_hash in held_out_cycles():
+            raise BagError(
+                f"{trace.bag}: drives {held_out_cycles()[trace.cycle_hash]}, a held-out cycle "
+                "that training must not see (unless allow_held_out says so)"
+            )
     return Recordings(
-        dp=tuple(trace for trace in given if trace.policy in EXPERT),
-        rule=(*(trace for trace in given if trace.policy not in EXPERT), *rule),
+        dp=_in_order(trace for trace in given if trace.policy in EXPERT),
+        rule=_in_order((*(trace for trace in given if trace.policy not in EXPERT), *rule)),
     )
+
+
+def _in_order(traces: Iterable[Trace]) -> tuple[Trace, ...]:
+    return tuple(sorted(traces, key=lambda t: (t.bag_hash, t.run_id, int(t.stamp_ns[0]))))
+
+
+@lru_cache(maxsize=1)
+def held_out_cycles() -> dict[str, str]:
+    """Names of the shipped held-out cycles by their SHA-256."""
+    return {cycle_hash(load_cycle(name)): name for name in cycle_names("held_out")}
 
 
 def check_trace(trace: Trace, params: PowertrainParams, *, allow_other_powertrain: bool) -> None:

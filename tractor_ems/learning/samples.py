@@ -10,6 +10,8 @@ from tractor_ems.policies.q_policy import Normalisation, demand_inputs
 from tractor_msgs_py.errors import ConfigError
 from tractor_msgs_py.observation import DemandFilter, ObservationSpec, filter_trace
 from tractor_msgs_py.trajectory import FloatArray, IntArray
+from tractor_sim.generator import to_bus_w
+from tractor_sim.powertrain import PowertrainParams
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,17 @@ class DemandSamples:
     power_demand_w: FloatArray
     inputs: Float32Array
     steps: IntArray
+
+
+def servable_demand_w(params: PowertrainParams, power_demand_w: FloatArray) -> FloatArray:
+    """Demand cut to what engine and battery can serve and take together, any shape [W].
+
+    Beyond these bounds every action saturates alike, so nothing can be learned there; left in, a
+    single spike of a sensor would widen the input scaling and every table by its own size.
+    """
+    peak_w, battery_w = params.engine.power_max_w, params.battery.power_max_w
+    engine_w = float(to_bus_w(params.generator, np.array(peak_w), peak_w))
+    return np.clip(power_demand_w, -battery_w, engine_w + battery_w)
 
 
 def demand_scaling(demands_w: Sequence[FloatArray]) -> Normalisation:

@@ -3,17 +3,17 @@
 torch is imported when a run begins, not with this module.
 """
 
-import shlex
 import signal
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
+
+import numpy as np
 
 from tractor_ems.learning.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
 from tractor_ems.learning.config import TrainConfig, learning_rate
@@ -21,7 +21,8 @@ from tractor_ems.learning.recordings import Recordings, read_recordings
 from tractor_ems.learning.training_log import Report, training_log
 from tractor_ems.policies.q_policy import save_policy
 from tractor_msgs_py import __version__
-from tractor_msgs_py.errors import ConfigError
+from tractor_msgs_py.errors import ConfigError, RunAborted
+from tractor_msgs_py.provenance import command_line as own_command_line
 from tractor_sim.config import load_powertrain
 from tractor_sim.powertrain import PowertrainParams
 from tractor_sim.powertrain_json import powertrain_hash
@@ -86,15 +87,23 @@ def train(
         resume: continue from the checkpoint beside ``out``.
         tensorboard: folder for TensorBoard logs.
         command_line: what to record as the command that made the policy; None: this process's.
+            A resumed run records that of the run it goes on from.
 
     Raises:
         BagError: a bag cannot be read or does not fit.
-        ConfigError: nothing to learn from, torch is missing, or the checkpoint does not fit.
+        ConfigError: nothing to learn from, torch is missing, ``out`` is no name for a policy
+            file, or the checkpoint does not fit.
+        RunAborted: the loss or a weight is not finite any more; nothing of that is saved.
         KeyboardInterrupt: Ctrl-C, after a checkpoint was written.
     """
+    check_output(out)
     params = load_powertrain(config.powertrain)
     recordings = read_recordings(
-        bags, rule_bags, params, allow_other_powertrain=config.allow_other_powertrain
+        bags,
+        rule_bags,
+        params,
+        allow_other_powertrain=config.allow_other_powertrain,
+        allow_held_out=config.allow_held_out,
     )
     return train_on(
         config,
@@ -122,6 +131,7 @@ def train_on(
     command_line: str | None = None,
 ) -> TrainReport:
     """:func:`train` on recordings that are already read."""
+    check_output(out)
     try:
         from tractor_ems.learning.experiment import begin, make_generators, prepare
         from tractor_ems.learning.networks import one_thread
@@ -135,7 +145,7 @@ def train_on(
     identity = {
         "config": config.to_json(),
         "powertrain_hash": powertrain_hash(params),
-        "bag_hashes": recordings.bag_hashes,
+        **recordings.identity,
         "package_version": __version__,
     }
     saved = checkpoint_path(out)
@@ -143,9 +153,12 @@ def train_on(
     with one_thread(), _deferred_interrupt() as interrupted:
         run = begin(experiment, generators)
         learner = run.learner
-        if resume:
-            run.restore(*load_checkpoint(saved, identity))
         metrics: dict[str, float] = {}
+        origin = own_command_line() if command_line is None else command_line
+        if resume:
+            tensors, state = load_checkpoint(saved, identity)
+            run.restore(tensors, state)
+            metrics, origin = dict(state["metrics"]), str(state["command_line"])
         stopped = False
         with training_log(out.with_suffix(".jsonl"), learner.step, tensorboard) as log:
             reported, since = learner.step, began
@@ -153,6 +166,7 @@ def train_on(
                 run.before_update()
                 latest = learner.update()
                 step = learner.step
+                _refuse_divergence(step, {"loss": latest["losses/td_loss"]})
                 if step % LOG_EVERY == 0 or step == config.updates:
                     now = time.perf_counter()
                     metrics = {name: float(value) for name, value in latest.items()}
@@ -165,12 +179,15 @@ def train_on(
                             report(step, metrics)
                 stopped = bool(interrupted) or (stop is not None and stop())
                 if step % config.checkpoint_every == 0 or stopped:
-                    save_checkpoint(saved, learner.tensors(), run.state(), identity)
+                    tensors = learner.tensors()
+                    _refuse_divergence(step, tensors)
+                    state = {**run.state(), "metrics": metrics, "command_line": origin}
+                    save_checkpoint(saved, tensors, state, identity)
         finished = learner.step == config.updates
         if finished:
             metadata = {
                 "package_version": __version__,
-                "command_line": _command_line() if command_line is None else command_line,
+                "command_line": origin,
                 "config": config.to_json(),
                 "seed": config.seed,
                 "bag_hashes": recordings.bag_hashes,
@@ -203,9 +220,23 @@ def train_on(
     )
 
 
-def _command_line() -> str:
-    """This process's command, its program by name: where it is installed is nobody's business."""
-    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+def check_output(out: Path) -> None:
+    """Refuse a name that no policy can be written to, or be found by afterwards.
+
+    Raises:
+        ConfigError: not ``.safetensors``, or a folder.
+    """
+    if out.suffix != ".safetensors":
+        raise ConfigError(f"{out}: the policy file must end in .safetensors")
+    if out.is_dir():
+        raise ConfigError(f"{out}: is a folder, give the policy file to write")
+
+
+def _refuse_divergence(step: int, values: Mapping[str, Any]) -> None:
+    for name, value in values.items():
+        if not np.all(np.isfinite(np.asarray(value))):
+            shown = f"{float(value)}" if np.ndim(value) == 0 else "not finite"
+            raise RunAborted(f"training diverged at update {step}: {name} is {shown}")
 
 
 @contextmanager
