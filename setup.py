@@ -17,12 +17,12 @@ ROOT = Path(__file__).resolve().parent
 
 EXECUTABLES = {
     "ems": "tractor_ems.cli:main",
-    "plant_sim": "tractor_sim.nodes.plant_sim:main",
-    "rule_based_policy": "tractor_ems.nodes.rule_based_policy:main",
-    "dp_policy": "tractor_ems.nodes.dp_policy:main",
-    "ddqn_policy": "tractor_ems.nodes.ddqn_policy:main",
-    "bag_recorder": "tractor_ems.nodes.bag_recorder:main",
-    "trainer": "tractor_ems.nodes.trainer:main",
+    "plant_sim": "tractor_ems.executables:plant_sim",
+    "rule_based_policy": "tractor_ems.executables:rule_based_policy",
+    "dp_policy": "tractor_ems.executables:dp_policy",
+    "ddqn_policy": "tractor_ems.executables:ddqn_policy",
+    "bag_recorder": "tractor_ems.executables:bag_recorder",
+    "trainer": "tractor_ems.executables:trainer",
 }
 
 # `ros2 run` looks in lib/<package>, pip installs console scripts in bin/ alone: one launcher per
