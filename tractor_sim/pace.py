@@ -12,6 +12,9 @@ from tractor_msgs_py.errors import RunAborted
 from tractor_msgs_py.types import BatteryPowerCommand, Sample
 from tractor_sim.plant_run import PlantRun
 
+PARTIAL_S = 3.0
+"""How long a policy that hears the demand may take to subscribe the rest, if it wants it [s]."""
+
 
 @dataclass(frozen=True)
 class Peers:
@@ -22,15 +25,21 @@ class Peers:
         observation_subscribers: subscribers of the observation topic that has the fewest.
         run_info_delivered: every expected subscriber has acknowledged run_info, so no tick can
             overtake it.
+        demand_subscribers: subscribers of the power demand alone; 0 while run_info is on its way
+            to all.
     """
 
     command_publishers: int
     observation_subscribers: int
     run_info_delivered: bool
+    demand_subscribers: int = 0
 
 
 class StartGate:
     """Holds the first tick until one policy and the expected recorders are connected.
+
+    A policy may do without some topics: when only the demand is subscribed by all for
+    :data:`PARTIAL_S`, the run starts, and unanswered ticks are repeated anyway.
 
     ``match_timeout_s`` of 0 waits for ever. ``missing`` says for whom it waits.
     """
@@ -40,6 +49,7 @@ class StartGate:
         self._needed = 1 + expected_recorders
         self._timeout_s = match_timeout_s
         self._since_s: float | None = None
+        self._partial_since_s: float | None = None
 
     def open(self, peers: Peers, now_s: float) -> bool:
         """True once the run may start.
@@ -48,8 +58,8 @@ class StartGate:
             RunAborted: nobody came within the timeout, or more than one policy did.
         """
         refuse_second_policy(peers.command_publishers)
-        enough = peers.observation_subscribers >= self._needed
-        if peers.command_publishers == 1 and enough and peers.run_info_delivered:
+        enough = peers.observation_subscribers >= self._needed and peers.run_info_delivered
+        if peers.command_publishers == 1 and (enough or self._partial(peers, now_s)):
             self.missing = ""
             return True
         self.missing = (
@@ -61,6 +71,14 @@ class StartGate:
         if 0.0 < self._timeout_s < now_s - self._since_s:
             raise RunAborted(f"not started within {self._timeout_s:g} s: {self.missing}")
         return False
+
+    def _partial(self, peers: Peers, now_s: float) -> bool:
+        if peers.demand_subscribers < self._needed:
+            self._partial_since_s = None
+            return False
+        if self._partial_since_s is None:
+            self._partial_since_s = now_s
+        return now_s - self._partial_since_s >= PARTIAL_S
 
 
 def refuse_second_policy(command_publishers: int) -> None:

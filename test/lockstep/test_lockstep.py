@@ -11,7 +11,7 @@ from tractor_msgs_py.errors import RunAborted
 from tractor_msgs_py.trajectory import trajectory_hash
 from tractor_msgs_py.types import BatteryPowerCommand, CommandMode
 from tractor_sim.lockstep import RESEND_S, Lockstep
-from tractor_sim.pace import Peers
+from tractor_sim.pace import PARTIAL_S, Peers
 from tractor_sim.powertrain import Command
 
 EVERYONE = Peers(command_publishers=1, observation_subscribers=1, run_info_delivered=True)
@@ -44,6 +44,16 @@ def test_no_tick_before_policy_and_recorders_are_connected_and_informed(make_run
     assert lockstep.start(peers, 0.0) == ()
     first = lockstep.start(Peers(1, 2, True), 1e6)
     assert {sample.stamp_ns for sample in first} == {lockstep.run.info.t0_ns} and len(first) == 3
+
+
+def test_a_policy_that_wants_the_demand_alone_is_served_after_a_while(make_run):
+    lockstep = Lockstep(make_run(), answer_timeout_s=5.0)
+    partial = Peers(1, 0, False, demand_subscribers=1)
+    assert lockstep.start(partial, 0.0) == ()
+    assert lockstep.start(partial, PARTIAL_S - 0.01) == ()
+    assert lockstep.start(Peers(1, 0, False, demand_subscribers=0), PARTIAL_S) == ()
+    assert lockstep.start(partial, 10.0) == ()
+    assert len(lockstep.start(partial, 10.0 + PARTIAL_S)) == 3
 
 
 def test_nobody_within_the_match_timeout_ends_the_run_and_says_who_is_missing(make_run):

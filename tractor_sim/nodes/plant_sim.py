@@ -72,12 +72,15 @@ class PlantSim:
             publisher.publish(msg)
 
     def _peers(self) -> Peers:
-        info, *observed = self._publishers.values()
-        everyone = info.get_subscription_count() > self._run.info.expected_recorders
+        counts = {n: p.get_subscription_count() for n, p in self._publishers.items()}
+        announced = counts.pop(topics.RUN_INFO.name) > self._run.info.expected_recorders
+        delivered = announced and self._beginning.complete(time.monotonic())
         return Peers(
             self._commands.get_publisher_count(),
-            min(publisher.get_subscription_count() for publisher in observed),
-            everyone and self._beginning.complete(time.monotonic()),
+            min(counts.values()),
+            delivered,
+            # Who has subscribed run_info must have it before any tick.
+            counts[topics.POWER_DEMAND.name] if delivered or not announced else 0,
         )
 
     def _poll(self) -> None:
