@@ -107,7 +107,7 @@ def test_sigterm_leaves_a_checkpoint_and_exits_0(
     bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     out, log = tmp_path / "p.safetensors", tmp_path / "log"
-    given = {"bags": f"['{bags / 'best'}']", "output": str(out), "updates": "100000000"}
+    given = {"bags": str(bags / "best"), "output": str(out), "updates": "100000000"}
     with (
         domain_id() as domain,
         progress(domain, monkeypatch) as look,
@@ -149,6 +149,8 @@ def test_sigterm_exits_2_where_the_checkpoint_cannot_be_written(
     ("parameters", "named"),
     [
         ({"bags": "['/no/such/bag']", "output": "p.safetensors"}, "/no/such/bag"),
+        ({"bags": "/no/such/bag", "output": "p.safetensors"}, "/no/such/bag"),
+        ({"bags": "7", "output": "p.safetensors"}, "parameter bags"),
         ({"bags": "['x']"}, "parameter output"),
         ({"bags": "['x']", "output": "p.safetensors", "targets": "guess"}, "parameter targets"),
     ],

@@ -33,7 +33,8 @@ def train(
         int | None, typer.Option(help="Simulated episodes to add; none are needed.")
     ] = None,
     rule_share: Annotated[
-        float | None, typer.Option(help="Share of the replay buffer seeded from rule-based bags.")
+        float | None,
+        typer.Option(help="Replay share of rule-based bags, 0..1; 0.25 with --rule-bags."),
     ] = None,
     allow_other_powertrain: Annotated[
         bool, typer.Option(help="Learn from the demand in bags recorded on another powertrain.")
@@ -52,7 +53,7 @@ def train(
     Ctrl-C leaves a checkpoint beside the output; --resume goes on from it and gives the same
     bytes as a run that was never interrupted.
     """
-    from tractor_ems.learning.config import load_train_config
+    from tractor_ems.learning.config import load_train_config, rule_share_of
     from tractor_ems.learning.train import train as run
 
     overrides: dict[str, Any] = {
@@ -62,7 +63,7 @@ def train(
         "seed": seed,
         "updates": updates,
         "interact": interact,
-        "sampled.rule_share": rule_share,
+        "sampled.rule_share": rule_share_of(rule_share, rule_bags),
         "allow_other_powertrain": True if allow_other_powertrain else None,
         "allow_held_out": True if allow_held_out else None,
     }

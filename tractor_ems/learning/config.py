@@ -1,7 +1,7 @@
 """Settings of a training run, checked where they are made; presets are config/training/*.yaml."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -168,6 +168,14 @@ def learning_rate(mode: CounterfactualConfig | SampledConfig, step: int) -> floa
     done = min((step - begin) / (mode.updates - begin), 1.0)
     low = mode.final_fraction
     return mode.learning_rate * (low + (1.0 - low) * 0.5 * (1.0 + math.cos(math.pi * done)))
+
+
+def rule_share_of(given: float | None, rule_bags: Sequence[object] | None) -> float | None:
+    """Replay share of rule-based recordings: as given; the paper's quarter where such bags are
+    named but no share (None or negative); None, the preset's, where neither is."""
+    if given is not None and given >= 0:
+        return given
+    return 0.25 if any(rule_bags or ()) else None
 
 
 def load_train_config(

@@ -16,7 +16,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from tractor_ems.learning.config import load_train_config
+from tractor_ems.learning.config import load_train_config, rule_share_of
 from tractor_ems.learning.rewards import RewardKind
 from tractor_ems.learning.train import TrainReport, train
 from tractor_msgs_py.errors import ConfigError, TractorEmsError
@@ -39,7 +39,7 @@ PARAMETERS = (
     Parameter("seed", -1, "seed of every generator, -1: the preset's", "", -1, 2**62),
     Parameter("interact", -1, "simulated episodes to add, -1: the preset's", "", -1, 1_000_000),
     Parameter(
-        "rule_share", -1.0, "replay share from rule-based bags, -1: the preset's", "", -1.0, 1.0
+        "rule_share", -1.0, "replay share from rule-based bags, -1: 0.25 with rule_bags", "", -1, 1
     ),
     Parameter("allow_other_powertrain", False, "learn from bags of another powertrain"),
     Parameter("allow_held_out", False, "learn from bags of held-out cycles"),
@@ -129,7 +129,7 @@ def _overrides(values: Mapping[str, Any]) -> dict[str, Any]:
         "updates": values["updates"] or None,
         "seed": None if values["seed"] < 0 else values["seed"],
         "interact": None if values["interact"] < 0 else values["interact"],
-        "sampled.rule_share": None if values["rule_share"] < 0 else values["rule_share"],
+        "sampled.rule_share": rule_share_of(values["rule_share"], values["rule_bags"]),
         "allow_other_powertrain": values["allow_other_powertrain"] or None,
         "allow_held_out": values["allow_held_out"] or None,
     }

@@ -101,6 +101,8 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Any]:
     values = {}
     for parameter in parameters:
         descriptor = ParameterDescriptor(description=parameter.text, read_only=True)
+        # One path is not a list to ROS; whoever gives one means a list of one.
+        descriptor.dynamic_typing = isinstance(parameter.default, list)
         if parameter.minimum is not None and parameter.maximum is not None:
             if isinstance(parameter.default, float):
                 descriptor.floating_point_range = [
@@ -123,6 +125,13 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Any]:
             raise ConfigError(
                 f"parameter {parameter.name}: {shown!r} is not a valid {kind}; {parameter.text}"
             ) from None
+        if isinstance(parameter.default, list):
+            value = [value] if isinstance(value, str) else value
+            if not (isinstance(value, list) and all(isinstance(item, str) for item in value)):
+                raise ConfigError(
+                    f"parameter {parameter.name}: {value!r} is not a text or a list of texts; "
+                    f"{parameter.text}"
+                )
         if parameter.choices and value not in parameter.choices:
             raise ConfigError(f"parameter {parameter.name}: {value!r}; {parameter.text}")
         values[parameter.name] = value
