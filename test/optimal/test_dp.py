@@ -46,6 +46,7 @@ def quantised_plant() -> PowertrainParams:
         battery=dataclasses.replace(
             PAPER.battery, energy_j=16 * QUANTUM_W, soc_min=0.25, soc_max=0.75
         ),
+        soc_initial=0.5,
     )
 
 

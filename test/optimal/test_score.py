@@ -35,7 +35,7 @@ def with_battery(energy_j: float, power_max_w: float, soc_min: float, soc_max: f
         soc_min=soc_min,
         soc_max=soc_max,
     )
-    return dataclasses.replace(PAPER, battery=battery)
+    return dataclasses.replace(PAPER, battery=battery, soc_initial=0.5 * (soc_min + soc_max))
 
 
 PLANTS = [PAPER, with_battery(144e6, 150e3, 0.3, 0.8), with_battery(18e6, 100e3, 0.2, 0.9)]
