@@ -16,11 +16,11 @@ import numpy as np
 
 from tractor_msgs_py.errors import ConfigError
 from tractor_msgs_py.trajectory import BoolArray, FloatArray
-from tractor_sim.engine import EngineParams, efficiency, fuel_rate_kg_per_s
+from tractor_sim.engine import EngineParams, best_power_w, efficiency, fuel_rate_kg_per_s
 from tractor_sim.generator import to_bus_w, to_crank_w
 from tractor_sim.powertrain import PowertrainParams
 
-RewardKind = Literal["fuel", "piecewise", "equivalent_fuel"]
+RewardKind = Literal["fuel", "piecewise", "piecewise_corrected", "equivalent_fuel"]
 
 ENGINE_OFF_REWARD = 0.46 + 2.0
 GOOD_FROM_W, GOOD_TO_W, TOP_W = 1.1e5, 1.9e5, 2.75e5
@@ -64,7 +64,7 @@ class RewardConfig:
     @property
     def cost_unit(self) -> float:
         """Cost that a network sees as 1: 10 g of fuel, or one unit of the shaped reward."""
-        return 1.0 if self.kind == "piecewise" else 0.010
+        return 1.0 if self.kind.startswith("piecewise") else 0.010
 
 
 def best_specific_fuel_kg_per_j(params: PowertrainParams) -> float:
@@ -73,6 +73,12 @@ def best_specific_fuel_kg_per_j(params: PowertrainParams) -> float:
     crank_w = np.union1d(np.linspace(0.0, engine.power_max_w, 4097)[1:], engine.curve_power_w[1:])
     bus_w = to_bus_w(params.generator, crank_w, engine.power_max_w)
     return float(np.min(fuel_rate_kg_per_s(engine, crank_w) / bus_w))
+
+
+def best_fuel_kg(params: PowertrainParams) -> float:
+    """Fuel of one step at the engine's best-efficiency power [kg]."""
+    best_w = np.array(best_power_w(params.engine))
+    return float(fuel_rate_kg_per_s(params.engine, best_w) * params.dt_s)
 
 
 def resolve(config: RewardConfig, params: PowertrainParams) -> RewardConfig:

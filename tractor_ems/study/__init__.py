@@ -1,0 +1,1 @@
+"""The paper's study: every algorithm, table and figure again, beside the printed values."""
