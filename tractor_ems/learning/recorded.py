@@ -132,6 +132,8 @@ def replay_transitions(
         reward=(rewards[:-1] / reward.cost_unit).astype(np.float32),
         discount=np.full(count, gamma, dtype=np.float32),
         next_inputs=inputs[1:],
+        first=first[:-1].astype(np.int16),
+        last=last[:-1].astype(np.int16),
         next_first=first[1:].astype(np.int16),
         next_last=last[1:].astype(np.int16),
     )

@@ -15,6 +15,8 @@ _DTYPES: dict[str, Any] = {
     "action": np.int64,
     "reward": np.float32,
     "discount": np.float32,
+    "first": np.int16,
+    "last": np.int16,
     "next_first": np.int16,
     "next_last": np.int16,
 }
@@ -30,7 +32,7 @@ class Transitions:
         reward: in reward units, float32.
         discount: gamma, or 0 where the next state is terminal. The end of a cycle is a
             truncation: its last step has no successor and is not stored.
-        next_first, next_last: feasible actions of the next state, inclusive.
+        first, last: feasible actions of the state, inclusive; next_first, next_last: of the next.
     """
 
     inputs: NDArray[np.float32]
@@ -38,6 +40,8 @@ class Transitions:
     reward: NDArray[np.float32]
     discount: NDArray[np.float32]
     next_inputs: NDArray[np.float32]
+    first: NDArray[np.int16]
+    last: NDArray[np.int16]
     next_first: NDArray[np.int16]
     next_last: NDArray[np.int16]
 

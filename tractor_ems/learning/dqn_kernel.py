@@ -1,0 +1,457 @@
+"""DQN and double DQN, compiled: the whole update on one screen, :func:`td_update`.
+
+    a* = argmax_a Q(s', a; theta)      over the feasible a       (double; DQN: theta^-)
+    y  = r + gamma Q(s', a*; theta^-)
+    theta <- theta - alpha Adam(grad Huber(Q(s, a; theta) - y))
+
+Infeasible actions are masked in the bootstrap too: a network says anything about actions nobody
+can take, and the largest of such values would leak into every target.
+
+With 1600 outputs the head is all of the cost. Forward, only feasible actions are computed, in
+tiles that stay in a near cache; backward, only the chosen action's column has a gradient.
+"""
+
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from tractor_ems.policies.mlp import Float32Array
+
+FAST = {"reassoc", "contract", "nsz", "arcp"}
+"""Sums may be reordered, which vectorises them; NaN and infinity keep their meaning."""
+
+TILE = 256
+"""Head outputs at a time: 64 inputs by 256 outputs of float32 are 64 KB, near the core."""
+
+ROWS = 4
+"""Samples at a time in a product, as :func:`_affine` is written out for."""
+
+TINY = 1e-30
+"""Moments below this become zero: an action that is never taken would else decay into
+denormal numbers, which processors multiply a hundred times slower."""
+
+BETA1, BETA2, ADAM_EPS = 0.9, 0.999, 1e-8
+
+
+class QNet(NamedTuple):
+    """Fully connected layers as views of one flat vector.
+
+    Attributes:
+        flat: every parameter, shape (P,).
+        weights: by layer, shape (inputs, outputs); biases: shape (1, outputs).
+    """
+
+    flat: Float32Array
+    weights: tuple[Float32Array, ...]
+    biases: tuple[Float32Array, ...]
+
+
+class Adam(NamedTuple):
+    """Gradient and moments, each laid out like the parameters; ``gradient.flat`` is zero between
+    updates."""
+
+    gradient: QNet
+    mean: Float32Array
+    square: Float32Array
+
+
+class Batch(NamedTuple):
+    """B transitions, as in ``replay.Transitions``; the first ``experts`` of them are an expert's.
+
+    ``first`` and ``last`` bound the feasible actions of the state, ``next_*`` of the next one.
+    """
+
+    inputs: Float32Array
+    action: NDArray[np.int64]
+    reward: Float32Array
+    discount: Float32Array
+    next_inputs: Float32Array
+    first: NDArray[np.int16]
+    last: NDArray[np.int16]
+    next_first: NDArray[np.int16]
+    next_last: NDArray[np.int16]
+    experts: int
+
+
+class Rule(NamedTuple):
+    """How to update.
+
+    Attributes:
+        double: choose with the online net, evaluate with the target net.
+        huber: Huber loss, else half the squared error.
+        tanh: activation, else ReLU.
+        margin: of the ordinal large-margin loss on experts' transitions, 0 for none: an action
+            at distance d (share of the grid) must be worth ``margin * d`` less than the expert's.
+            A flat margin would push 1599 nearly equal actions down.
+    """
+
+    double: bool
+    huber: bool
+    tanh: bool
+    margin: float
+
+
+class Workspace(NamedTuple):
+    """Room for one batch: activations by layer (input first), their gradients, action values."""
+
+    layers: tuple[Float32Array, ...]
+    next_layers: tuple[Float32Array, ...]
+    slopes: tuple[Float32Array, ...]
+    values: Float32Array
+    best: Float32Array
+    chosen: NDArray[np.int64]
+
+
+def net_of(sizes: tuple[int, ...], flat: Float32Array) -> QNet:
+    """Views of a flat parameter vector, shape (parameters(sizes),)."""
+    weights, biases, at = [], [], 0
+    for inputs, outputs in pairwise(sizes):
+        weights.append(flat[at : at + inputs * outputs].reshape(inputs, outputs))
+        at += inputs * outputs
+        biases.append(flat[at : at + outputs].reshape(1, outputs))
+        at += outputs
+    return QNet(flat, tuple(weights), tuple(biases))
+
+
+def parameters(sizes: tuple[int, ...]) -> int:
+    """Number of weights and biases."""
+    return sum((a + 1) * b for a, b in pairwise(sizes))
+
+
+def zero_net(sizes: tuple[int, ...]) -> QNet:
+    """All zero."""
+    return net_of(sizes, np.zeros(parameters(sizes), np.float32))
+
+
+def random_net(sizes: tuple[int, ...], rng: np.random.Generator) -> QNet:
+    """Weights and biases uniform in +-1/sqrt(inputs), drawn from ``rng``."""
+    net = zero_net(sizes)
+    for weight, bias in zip(net.weights, net.biases, strict=True):
+        bound = len(weight) ** -0.5
+        # Drawn output by output, the order in which networks.Net draws.
+        weight[:] = rng.uniform(-bound, bound, weight.shape[::-1]).astype(np.float32).T
+        bias[:] = rng.uniform(-bound, bound, bias.shape).astype(np.float32)
+    return net
+
+
+def make_adam(sizes: tuple[int, ...]) -> Adam:
+    """At rest."""
+    count = parameters(sizes)
+    return Adam(zero_net(sizes), np.zeros(count, np.float32), np.zeros(count, np.float32))
+
+
+def make_workspace(sizes: tuple[int, ...], batch: int) -> Workspace:
+    """For batches of ``batch``."""
+
+    def layers() -> tuple[Float32Array, ...]:
+        return tuple(np.zeros((batch, width), np.float32) for width in sizes[:-1])
+
+    return Workspace(
+        layers=layers(),
+        next_layers=layers(),
+        slopes=layers(),
+        values=np.zeros((batch, max(TILE, *sizes[:-1])), np.float32),
+        best=np.zeros(batch, np.float32),
+        chosen=np.zeros(batch, np.int64),
+    )
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def td_update(
+    online: QNet,
+    target: QNet,
+    adam: Adam,
+    work: Workspace,
+    batch: Batch,
+    rule: Rule,
+    learning_rate: float,
+    step: int,
+) -> tuple[float, float]:
+    """One gradient step of ``online``, in place.
+
+    Args:
+        step: number of this update, from 1: Adam's bias correction needs it.
+
+    Returns:
+        Mean loss (temporal difference and margin) and mean Q of the batch.
+    """
+    size = len(batch.action)
+    scale = np.float32(1.0 / size)
+
+    # y of every transition: its greedy next action, evaluated by the target net.
+    if rule.double:
+        forward(online, batch.next_inputs, work.next_layers, rule.tanh)
+        best_actions(online, work.next_layers[-1], batch.next_first, batch.next_last, size, work)
+        forward(target, batch.next_inputs, work.next_layers, rule.tanh)
+        for b in range(size):
+            work.best[b] = value_of(target, work.next_layers[-1], b, work.chosen[b])
+    else:
+        forward(target, batch.next_inputs, work.next_layers, rule.tanh)
+        best_actions(target, work.next_layers[-1], batch.next_first, batch.next_last, size, work)
+
+    # Gradient of the loss at the action taken; the rest of the head has none.
+    forward(online, batch.inputs, work.layers, rule.tanh)
+    hidden, slope = work.layers[-1], work.slopes[-1]
+    slope[:size] = np.float32(0.0)
+    loss, mean_q = 0.0, 0.0
+    for b in range(size):
+        q = value_of(online, hidden, b, batch.action[b])
+        error = q - (batch.reward[b] + batch.discount[b] * work.best[b])
+        if not rule.huber or abs(error) <= 1.0:
+            loss += 0.5 * error * error
+        else:
+            loss += abs(error) - 0.5
+            error = np.float32(1.0) if error > 0.0 else np.float32(-1.0)
+        mean_q += q
+        _pull(online, adam.gradient, hidden, slope, b, batch.action[b], error * scale)
+    if rule.margin > 0.0 and batch.experts > 0:
+        loss += _margin_loss(online, adam.gradient, hidden, slope, work, batch, rule.margin)
+    backward(online, adam.gradient, work, batch.inputs, size, rule.tanh)
+    _adam_step(online.flat, adam, learning_rate, step)
+    return loss / size, mean_q / size
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def forward(net: QNet, inputs: Float32Array, layers: tuple[Float32Array, ...], tanh: bool) -> None:
+    """Fill ``layers``: the inputs, then every hidden layer's activations."""
+    size = len(inputs)
+    layers[0][:size] = inputs
+    for n in range(len(layers) - 1):
+        here, width = layers[n + 1], net.weights[n].shape[1]
+        for b in range(0, size, ROWS):
+            _affine(net.weights[n], net.biases[n], layers[n], b, size, 0, width, here)
+        for b in range(size):
+            row = here[b]
+            for j in range(width):
+                row[j] = np.tanh(row[j]) if tanh else max(row[j], np.float32(0.0))
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def best_actions(
+    net: QNet,
+    hidden: Float32Array,
+    first: NDArray[np.int16],
+    last: NDArray[np.int16],
+    size: int,
+    work: Workspace,
+) -> None:
+    """Fill ``work.chosen`` and ``work.best`` with the best feasible action and its value."""
+    weight, bias, values = net.weights[-1], net.biases[-1], work.values
+    for b in range(size):
+        work.best[b] = -np.inf
+        work.chosen[b] = first[b]
+    for begin in range(0, weight.shape[1], TILE):
+        end = min(begin + TILE, weight.shape[1])
+        for block in range(0, size, ROWS):
+            rows = range(block, min(block + ROWS, size))
+            low, high = end, begin
+            for b in rows:
+                low, high = min(low, np.int64(first[b])), max(high, np.int64(last[b]) + 1)
+            low, high = max(low, begin), min(high, end)
+            if low >= high:
+                continue
+            _affine(weight, bias, hidden, block, size, low, high, values)
+            for b in rows:
+                start, stop = max(low, np.int64(first[b])), min(high, np.int64(last[b]) + 1)
+                if start >= stop:
+                    continue
+                row, most = values[b][start - low : stop - low], work.best[b]
+                most = max(most, _largest(row))
+                if most > work.best[b]:
+                    j = 0
+                    while j < len(row) - 1 and row[j] != most:
+                        j += 1
+                    work.best[b] = most
+                    work.chosen[b] = start + j
+
+
+@njit(cache=True, error_model="numpy", fastmath={*FAST, "nnan"})
+def _largest(values: Float32Array) -> float:
+    """Largest of (N,); vectorised because NaN is left out of account; the loss finds it."""
+    most = values[0]
+    for j in range(len(values)):
+        most = max(most, values[j])
+    return most
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _affine(
+    weight: Float32Array,
+    bias: Float32Array,
+    hidden: Float32Array,
+    block: int,
+    size: int,
+    low: int,
+    high: int,
+    out: Float32Array,
+) -> None:
+    """out[b, :high - low] = outputs low..high - 1 of the ROWS samples from ``block`` on.
+
+    Four samples share every weight that is loaded, and four inputs every value that is stored.
+    """
+    begin, block = max(low, 0), max(block, 0)  # what might be negative is not vectorised
+    count, width = high - begin, weight.shape[0]
+    for b in range(block, min(block + ROWS, size)):
+        row = out[b]
+        for j in range(count):
+            row[j] = bias[0, begin + j]
+    whole = width - width % 4 if block + ROWS <= size else 0
+    if whole:
+        out0, out1, out2, out3 = out[block], out[block + 1], out[block + 2], out[block + 3]
+        in0, in1, in2, in3 = (
+            hidden[block],
+            hidden[block + 1],
+            hidden[block + 2],
+            hidden[block + 3],
+        )
+        for i in range(0, whole, 4):
+            a0, a1, a2, a3 = in0[i], in0[i + 1], in0[i + 2], in0[i + 3]
+            b0, b1, b2, b3 = in1[i], in1[i + 1], in1[i + 2], in1[i + 3]
+            c0, c1, c2, c3 = in2[i], in2[i + 1], in2[i + 2], in2[i + 3]
+            d0, d1, d2, d3 = in3[i], in3[i + 1], in3[i + 2], in3[i + 3]
+            for j in range(count):
+                k = begin + j
+                w0, w1, w2, w3 = weight[i, k], weight[i + 1, k], weight[i + 2, k], weight[i + 3, k]
+                out0[j] += a0 * w0 + a1 * w1 + a2 * w2 + a3 * w3
+                out1[j] += b0 * w0 + b1 * w1 + b2 * w2 + b3 * w3
+                out2[j] += c0 * w0 + c1 * w1 + c2 * w2 + c3 * w3
+                out3[j] += d0 * w0 + d1 * w1 + d2 * w2 + d3 * w3
+    for b in range(block, min(block + ROWS, size)):
+        row = out[b]
+        for i in range(whole, width):
+            x = hidden[b, i]
+            for j in range(count):
+                row[j] += x * weight[i, begin + j]
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def value_of(net: QNet, hidden: Float32Array, b: int, action: int) -> float:
+    """Q of one action, without the others."""
+    weight = net.weights[-1]
+    total = net.biases[-1][0, action]
+    for i in range(weight.shape[0]):
+        total += hidden[b, i] * weight[i, action]
+    return total
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _pull(
+    net: QNet,
+    gradient: QNet,
+    hidden: Float32Array,
+    slope: Float32Array,
+    b: int,
+    action: int,
+    amount: float,
+) -> None:
+    """Add the gradient of ``amount * Q(s_b, action)`` at the head, and below it to ``slope``."""
+    weight, into = net.weights[-1], gradient.weights[-1]
+    gradient.biases[-1][0, action] += amount
+    for i in range(weight.shape[0]):
+        into[i, action] += amount * hidden[b, i]
+        slope[b, i] += amount * weight[i, action]
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _margin_loss(
+    net: QNet,
+    gradient: QNet,
+    hidden: Float32Array,
+    slope: Float32Array,
+    work: Workspace,
+    batch: Batch,
+    margin: float,
+) -> float:
+    """max_a [Q(s, a) + margin |a - a_E| / A] - Q(s, a_E) over the experts' transitions."""
+    weight, bias, values = net.weights[-1], net.biases[-1], work.values
+    actions, total = weight.shape[1], 0.0
+    scale, rise = np.float32(1.0 / len(batch.action)), np.float32(margin / actions)
+    for b in range(batch.experts):
+        expert = batch.action[b]
+        own = value_of(net, hidden, b, expert)
+        most, rival = own, expert
+        for begin in range(np.int64(batch.first[b]), np.int64(batch.last[b]) + 1, TILE):
+            end = min(begin + TILE, np.int64(batch.last[b]) + 1)
+            _affine(weight, bias, hidden, b, b + 1, begin, end, values)
+            for j in range(end - begin):
+                value = values[b, j] + rise * abs(begin + j - expert)
+                if value > most:
+                    most, rival = value, begin + j
+        if rival != expert:
+            total += most - own
+            _pull(net, gradient, hidden, slope, b, rival, scale)
+            _pull(net, gradient, hidden, slope, b, expert, -scale)
+    return total
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def backward(
+    net: QNet, gradient: QNet, work: Workspace, inputs: Float32Array, size: int, tanh: bool
+) -> None:
+    """From ``work.slopes[-1]``, the loss's slope in the last hidden layer, down to the inputs."""
+    for n in range(len(work.layers) - 2, -1, -1):
+        below, here = work.layers[n], work.layers[n + 1]
+        slope, slope_below = work.slopes[n + 1], work.slopes[n]
+        weight, into, into_bias = net.weights[n], gradient.weights[n], gradient.biases[n]
+        width = weight.shape[1]
+        for b in range(size):
+            row = slope[b]
+            for j in range(width):
+                h = here[b, j]
+                row[j] *= (
+                    (np.float32(1.0) - h * h)
+                    if tanh
+                    else (np.float32(1.0) if h > 0.0 else np.float32(0.0))
+                )
+                into_bias[0, j] += row[j]
+            for i in range(weight.shape[0]):
+                x, total = below[b, i], np.float32(0.0)
+                for j in range(width):
+                    into[i, j] += x * row[j]
+                    total += row[j] * weight[i, j]
+                slope_below[b, i] = total
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _adam_step(flat: Float32Array, adam: Adam, learning_rate: float, step: int) -> None:
+    """Adam with bias correction over every parameter; leaves the gradient zero.
+
+    The factors are float32 literals' worth: a float64 among them would halve the vector width.
+    """
+    gradient, mean, square = adam.gradient.flat, adam.mean, adam.square
+    b1, c1 = np.float32(BETA1), np.float32(1.0 - BETA1)
+    b2, c2 = np.float32(BETA2), np.float32(1.0 - BETA2)
+    rate = np.float32(learning_rate / (1.0 - BETA1**step))
+    root = np.float32(1.0 / np.sqrt(1.0 - BETA2**step))
+    eps, zero, tiny = np.float32(ADAM_EPS), np.float32(0.0), np.float32(TINY)
+    for p in range(len(flat)):
+        g = gradient[p]
+        m = b1 * mean[p] + c1 * g
+        v = b2 * square[p] + c2 * g * g
+        m = m if abs(m) > tiny else zero
+        v = v if v > tiny else zero
+        mean[p], square[p], gradient[p] = m, v, zero
+        flat[p] -= rate * m / (np.sqrt(v) * root + eps)
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def move_target(target: QNet, online: QNet, rate: float) -> None:
+    """target += rate (online - target); rate 1 is a hard copy."""
+    t, o = target.flat, online.flat
+    if rate >= 1.0:
+        t[:] = o
+        return
+    r = np.float32(rate)
+    for p in range(len(t)):
+        t[p] += r * (o[p] - t[p])
+
+
+def as_arrays(net: QNet) -> dict[str, Any]:
+    """Weights (outputs, inputs) and biases by layer, as ``policies.mlp`` wants them."""
+    return {
+        "weights": tuple(np.ascontiguousarray(w.T) for w in net.weights),
+        "biases": tuple(b[0].copy() for b in net.biases),
+    }
