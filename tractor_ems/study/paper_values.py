@@ -189,3 +189,8 @@ def episodes_of(row_id: str) -> int | None:
 def episodes_text(episodes: float) -> str:
     """Episodes as the paper writes them: ``37,000``."""
     return f"{round(episodes):,}"
+
+
+def percent_text(share: float, digits: int = 1) -> str:
+    """A fraction as text: ``77.5 %``."""
+    return f"{round(100.0 * share, digits) + 0.0:.{digits}f} %"  # + 0.0 turns -0.0 into 0.0

@@ -25,8 +25,8 @@ class Interval:
     Attributes:
         value: over the runs themselves.
         low, high: ends of the percentile interval; equal to ``value`` where there is one run.
-        runs: of the smallest stratum. The percentile interval of 5 runs is too narrow (measured
-            in the tests: about 85 % coverage), of 10 about 91 %.
+        runs: of the smallest stratum. On normal runs the interval of 5 covers the truth in 91 %
+            of cases instead of 95 %, of 10 in 94 % (measured; the tests hold a looser bound).
     """
 
     value: float
@@ -36,9 +36,11 @@ class Interval:
 
     def text(self, digits: int = 3) -> str:
         """``0.970 [0.960, 0.980]``; one run has no interval."""
-        if self.runs < 2:
-            return f"{self.value:.{digits}f} (1 run)"
-        return f"{self.value:.{digits}f} [{self.low:.{digits}f}, {self.high:.{digits}f}]"
+        value, low, high = (
+            f"{round(number, digits) + 0.0:.{digits}f}"  # + 0.0 turns -0.0 into 0.0
+            for number in (self.value, self.low, self.high)
+        )
+        return f"{value} (1 run)" if self.runs < 2 else f"{value} [{low}, {high}]"
 
 
 @dataclass(frozen=True)
@@ -135,6 +137,21 @@ def ratio_interval(
     )
 
 
+def difference_interval(
+    first: FloatArray | Sequence[float],
+    second: FloatArray | Sequence[float],
+    rng: np.random.Generator,
+    resamples: int = RESAMPLES,
+) -> Interval:
+    """Interquartile mean of one row minus that of another, with its interval."""
+    return stratified_bootstrap(
+        lambda strata: interquartile_mean(strata[0]) - interquartile_mean(strata[1]),
+        [np.asarray(first), np.asarray(second)],
+        rng,
+        resamples,
+    )
+
+
 def probability_of_improvement(
     better: FloatArray | Sequence[float],
     worse: FloatArray | Sequence[float],
@@ -169,7 +186,8 @@ def iqm_band(
     """Interquartile mean over seeds at every point, with its interval.
 
     Args:
-        curves: shape (S, K), finite. All points share the resampled seeds.
+        curves: shape (S, K), finite; thin long ones, 40,000 points take 12 s. All points share
+            the resampled seeds.
     """
     data = _checked(curves, "curves")
     if data.ndim != 2:
