@@ -143,7 +143,8 @@ def _shaped() -> list[tuple[str, str, tuple[str, ...], _Judge]]:
             partial(faster, printed=dp_share),
         ),
         (
-            f"DP and rule-based seeding converges {percent_text(mixed_share)} faster than no seeding",
+            f"DP and rule-based seeding converges {percent_text(mixed_share)} faster than no "
+            "seeding",
             "summary table",
             (MIXED, NONE),
             partial(faster, printed=mixed_share),

@@ -113,7 +113,8 @@ def efficient(results: StudyResults, keys: Sequence[str]) -> Found:
     inside = defined_of(results, keys[0], _share_in_region)
     plain = defined_of(results, "ddqn@0.7", lambda o: o.efficiency)
     return above(efficiency, EFFICIENT), join(
-        f"efficiency {efficiency.text()}, {percent_text(EFFICIENT, 0)} or more is asked, the paper has 43 %",
+        f"efficiency {efficiency.text()}, {percent_text(EFFICIENT, 0)} or more is asked, "
+        "the paper has 43 %",
         f"{iqm_text(inside, 2)} of the running time at 110-190 kW",
         f"without shaping {iqm_text(plain)}",
     )

@@ -191,15 +191,16 @@ def _fuel_slips() -> tuple[Slip, ...]:
         Slip(
             "Table 1, load",
             "13 minutes at 216 kW on 1.69 gal",
-            f"as a mean load that needs {percent_text(load_j / fuel_j)} engine efficiency; 216 kW can "
-            "only be a peak",
+            f"as a mean load that needs {percent_text(load_j / fuel_j)} engine efficiency; "
+            "216 kW can only be a peak",
             "Table 1",
         ),
         Slip(
             "Table 1, first reduction",
             "-9.4 %, called a reduction",
             f"{load.fuel_gal} to {control_1.fuel_gal} gal is "
-            f"{percent_text(fewer(load.fuel_gal, control_1.fuel_gal))}, and a reduction needs no sign",
+            f"{percent_text(fewer(load.fuel_gal, control_1.fuel_gal))}, and a "
+            "reduction needs no sign",
             "Table 1",
         ),
         Slip(
@@ -274,8 +275,8 @@ def _method_slips() -> tuple[Slip, ...]:
         Slip(
             "size of the table",
             "far exceeds the practical limits of tabular Q-learning",
-            f"{size:,} entries are {4 * size / 1e6:.0f} MB in single precision, twice that for double Q; "
-            "what is too small is the number of visits, not the memory",
+            f"{size:,} entries are {4 * size / 1e6:.0f} MB in single precision, "
+            "twice that for double Q: memory is not the limit",
             "Results of Double Q-Learning",
         ),
         Slip(
