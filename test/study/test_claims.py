@@ -138,6 +138,8 @@ def test_near_dp_needs_fuel_efficiency_and_final_soc_at_once():
     assert judged("The shaped DDQN", plans={"ddqn_shaped": Plan(0.5, "best_point")}).verdict == (
         "does not hold"
     )
+    # Near DP in both, but 0.56 points of SOC below it.
+    assert judged("The shaped DDQN").verdict == "does not hold"
     # Least fuel of all, at the price of an empty battery.
     drained = judged("The shaped DDQN", plans={"ddqn_shaped": Plan(0.5, "myopic")})
     assert drained.verdict == "does not hold"
