@@ -2,7 +2,7 @@
 
 import typer
 
-from tractor_ems.cli import bag, cycle, demo, dp, evaluate, train
+from tractor_ems.cli import bag, cycle, demo, dp, evaluate, study, train
 
 app = typer.Typer(
     name="ems",
@@ -18,3 +18,4 @@ app.command("evaluate")(evaluate.evaluate)
 app.command("dp")(dp.dp)
 app.add_typer(cycle.app, name="cycle")
 app.add_typer(bag.app, name="bag")
+app.add_typer(study.app, name="study")

@@ -1,0 +1,102 @@
+"""``ems study``: reproduce the paper."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from tractor_ems.cli.output import NOTES, JsonFlag, print_json, print_table
+
+app = typer.Typer(no_args_is_help=True, help="Studies that are reproduced as a whole.")
+
+
+@app.callback()
+def studies() -> None:
+    """Studies that are reproduced as a whole."""
+
+
+@app.command()
+def paper(
+    preset: Annotated[
+        str, typer.Option(help="Budget: smoke (minutes), standard (about an hour), full (days).")
+    ] = "standard",
+    out: Annotated[
+        Path, typer.Option(help="Folder of bags, runs, checkpoints, report; kept and reused.")
+    ] = Path("out/study/paper"),
+    report: Annotated[
+        Path | None, typer.Option(help="Markdown report; default OUT/PRESET/reproduction.md.")
+    ] = None,
+    settings: Annotated[
+        str, typer.Option(help="config/study name or YAML file with every choice.")
+    ] = "paper",
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes; default one per core.")
+    ] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Train every agent of the paper, make its tables and figures, and write the report.
+
+    Ctrl-C leaves checkpoints; the same command goes on from them and from finished runs.
+    """
+    from tractor_ems.study.config import load_study
+    from tractor_ems.study.report import write_report
+    from tractor_ems.study.schedule import workers_of
+    from tractor_ems.study.study import run_study
+    from tractor_ems.study.tables import all_tables
+
+    config = load_study(settings, preset)
+    with _stages() as stage:
+        results = run_study(config, out, workers=workers_of(workers), stage=stage)
+    target = report or out / preset / "reproduction.md"
+    NOTES.print(f"tables and figures: {target}")
+    write_report(results, target, target.with_suffix(""))
+    tables = all_tables(results)
+    if json:
+        print_json({"report": str(target), "tables": [table.to_json() for table in tables]})
+        return
+    for table in tables:
+        print_table(table.title, table.columns, table.rows)
+
+
+@contextmanager
+def _stages() -> Iterator["StageBars"]:
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[done]}/{task.fields[jobs]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(elapsed_when_finished=True),
+        console=NOTES,
+        disable=not NOTES.is_terminal,
+    ) as bar:
+        yield StageBars(bar)
+
+
+class StageBars:
+    """One line per stage, over all processes."""
+
+    def __init__(self, bar: Progress) -> None:
+        self.bar = bar
+
+    def __call__(self, name: str, jobs: int) -> "StageBar":
+        """A new line; nothing to do gives none."""
+        if jobs and not NOTES.is_terminal:
+            NOTES.print(f"{name}: {jobs}")
+        task = self.bar.add_task(name, total=float(jobs), done=0, jobs=jobs, visible=jobs > 0)
+        return StageBar(self.bar, task)
+
+
+class StageBar:
+    """Progress of one stage."""
+
+    def __init__(self, bar: Progress, task: int) -> None:
+        self.bar, self.task = bar, task
+
+    def __call__(self, done: int, shares: Sequence[float]) -> None:
+        """Finished jobs are counted, running ones move the bar."""
+        from rich.progress import TaskID
+
+        self.bar.update(TaskID(self.task), completed=sum(shares), done=done)

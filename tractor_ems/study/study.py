@@ -1,0 +1,121 @@
+"""The study from settings to results: experts' bags, trained agents, baselines, Table 1."""
+
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tractor_ems.study.baselines import make_baselines
+from tractor_ems.study.config import StudyConfig
+from tractor_ems.study.experts import demonstrations, plant
+from tractor_ems.study.results import StudyResults
+from tractor_ems.study.run import Task, config_hash
+from tractor_ems.study.schedule import Progress, run_all
+from tractor_ems.study.store import is_done, load_run, run_folder
+from tractor_ems.study.table1 import table1_rows
+from tractor_msgs_py import __version__
+from tractor_msgs_py.errors import ConfigError
+from tractor_msgs_py.provenance import command_line
+from tractor_sim.duty_cycle.cycle import cycle_hash
+from tractor_sim.duty_cycle.library import load_cycle
+from tractor_sim.powertrain_json import powertrain_hash
+
+RANDOM_DRIVES_SEED = 0
+"""Of the baseline that takes random feasible actions."""
+
+Stage = Callable[[str, int], Progress]
+"""Called with the name of a stage and how many jobs it has; returns who hears of them."""
+
+
+def run_study(config: StudyConfig, out: Path, *, workers: int, stage: Stage) -> StudyResults:
+    """Everything that is not on disk yet, then the results.
+
+    Args:
+        out: folder of bags, runs and checkpoints. Runs are found again by the hash of everything
+            that decides them, so presets and sittings share one folder.
+        workers: processes at a time.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C; the same call goes on.
+        TractorEmsError: bad settings, a damaged file, or a run that was aborted.
+    """
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"{out}: is a file, give a folder for the study")
+    bags = out / "bags"
+    tasks = [task for task in all_tasks(config, out) if not is_done(*_finished(task))]
+    seeded = {task.row.soc_min for task in tasks if task.row.seeding != "none"}
+    needed = [
+        item
+        for item in demonstrations(config, bags)
+        if item.soc_min in seeded and not item.bag.exists()
+    ]
+    began = time.monotonic()
+    run_all(config, needed, workers=workers, progress=stage("recording experts", len(needed)))
+    run_all(config, tasks, workers=workers, progress=stage("training agents", len(tasks)))
+    return collect(config, out, time.monotonic() - began)
+
+
+def all_tasks(config: StudyConfig, out: Path) -> list[Task]:
+    """Every run of the study, the long ones first, so that no core waits for a late one."""
+    found = []
+    for row in config.rows:
+        for seed in range(config.budget.seeds):
+            folder = run_folder(out, row, seed, config_hash(config, row, seed))
+            found.append(Task(config, row, seed, folder, out / "bags"))
+    return sorted(found, key=lambda task: not task.row.tabular)
+
+
+def collect(config: StudyConfig, out: Path, seconds: float = 0.0) -> StudyResults:
+    """Results of finished runs, with baselines and Table 1 computed now.
+
+    Raises:
+        ConfigError: a run is missing or damaged.
+    """
+    runs = []
+    for row in config.rows:
+        for seed in range(config.budget.seeds):
+            folder = run_folder(out, row, seed, config_hash(config, row, seed))
+            runs.append(load_run(folder, row))
+    plants = {
+        soc_min: plant(config, soc_min) for soc_min in sorted({r.soc_min for r in config.rows})
+    }
+    cycle = load_cycle(config.cycle)
+    return StudyResults(
+        preset=config.preset,
+        episodes_deep=config.budget.network_episodes,
+        episodes_tabular=config.budget.table_episodes,
+        steps_per_update=config.budget.steps_per_update,
+        runs=tuple(runs),
+        baselines=make_baselines(
+            plants,
+            cycle.power_demand_w,
+            np.random.default_rng(RANDOM_DRIVES_SEED),
+            soc_initial=config.soc_initial,
+            soc_target=config.soc_target,
+        ),
+        table1=table1_rows(),
+        differences=config.differences,
+        provenance=_provenance(config, [run.seconds for run in runs], seconds),
+    )
+
+
+def _finished(task: Task) -> tuple[Path, str]:
+    return task.folder, config_hash(task.config, task.row, task.seed)
+
+
+def _provenance(config: StudyConfig, spent: list[float], seconds: float) -> dict[str, Any]:
+    return {
+        "command": command_line(),
+        "package_version": __version__,
+        "preset": config.preset,
+        "seeds": list(range(config.budget.seeds)),
+        "powertrain_hash": powertrain_hash(plant(config, config.rows[0].soc_min)),
+        "cycle_hash": cycle_hash(load_cycle(config.cycle)),
+        "training_s_all_runs": sum(spent),
+        "wall_s_this_sitting": seconds,
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+    }
