@@ -24,7 +24,8 @@ def train(
         str | None, typer.Option(help="counterfactual (default) or sampled (the paper's way).")
     ] = None,
     reward: Annotated[
-        str | None, typer.Option(help="equivalent_fuel (default), fuel or piecewise.")
+        str | None,
+        typer.Option(help="equivalent_fuel (default), fuel, piecewise or piecewise_corrected."),
     ] = None,
     powertrain: Annotated[str | None, typer.Option(help="Shipped name or YAML file.")] = None,
     updates: Annotated[int | None, typer.Option(help="Gradient steps.")] = None,

@@ -32,14 +32,16 @@ class RewardConfig:
 
     Attributes:
         kind: ``fuel``: r = -fuel. ``piecewise``: the paper's shaped reward as printed.
-            ``equivalent_fuel``: r = -(fuel + start + price of battery energy).
+            ``piecewise_corrected``: its band and slopes without its slips, see
+            :func:`band_penalty`. ``equivalent_fuel``: r = -(fuel + start + price of battery
+            energy).
         lambda0_kg_per_j: price of battery energy at the target SOC, > 0; None: the engine's best
             specific fuel, which on a lossless battery is the exact co-state [kg/J].
         kp: relative rise of the price per unit of SOC below the target, >= 0:
             lambda(SOC) = lambda0 (1 + kp (SOC_target - SOC)).
         start_price_kg: least price of an engine start, >= 0 [kg]. Where the plant's own start
             fuel is less, the difference is a price that learning sees and no tank does. It makes
-            the engine run in stretches; 0 switches it off.
+            the engine run in stretches; 0 switches it off. Only ``equivalent_fuel`` has it.
     """
 
     __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read where YAML is checked)
@@ -63,7 +65,7 @@ class RewardConfig:
 
     @property
     def cost_unit(self) -> float:
-        """Cost that a network sees as 1: 10 g of fuel, or one unit of the shaped reward."""
+        """Cost that a network sees as 1: 10 g of fuel, or one unit of a shaped reward."""
         return 1.0 if self.kind.startswith("piecewise") else 0.010
 
 
@@ -125,27 +127,56 @@ def piecewise_reward(engine: EngineParams, engine_power_w: FloatArray) -> FloatA
     )
 
 
+def band_penalty(engine_power_w: FloatArray) -> FloatArray:
+    """What the corrected shaped reward takes off outside 110..190 kW of crankshaft power [W].
+
+        0                       P = 0, or 1.1e5 <= P <= 1.9e5
+        2e-6 (1.1e5 - P)        0 < P < 1.1e5
+        6e-6 (P - 1.9e5)        1.9e5 < P
+
+    The whole reward is r = -((fuel + battery price) / fuel of a step at the best point + penalty).
+    Band and slopes are the paper's; each change removes one property of the print:
+
+        engine off earns 2.46, more than any engine point    off has no bonus and no penalty, and
+                                                             the battery energy that it takes is
+                                                             paid for at lambda(SOC)
+        outside the band the reward falls as efficiency      efficiency enters through the fuel,
+        rises (its term is -eta there)                       with one sign everywhere
+        jumps of 2.4 at 110 kW and 1.9 at 190 kW             the penalty starts from 0 at both
+        exactly 275 kW earns -2                              the upper branch has no end
+    """
+    power_w = np.asarray(engine_power_w, dtype=np.float64)
+    below = np.where(power_w > 0.0, 2e-6 * np.maximum(GOOD_FROM_W - power_w, 0.0), 0.0)
+    return below + 6e-6 * np.maximum(power_w - GOOD_TO_W, 0.0)
+
+
 def running_cost(
     config: RewardConfig,
     params: PowertrainParams,
     engine_power_w: FloatArray,
     engine_on: BoolArray | None = None,
 ) -> FloatArray:
-    """Cost of running at a bus power over one step: fuel without start fuel [kg], or minus the
-    shaped reward. ``engine_on`` defaults to ``engine_power_w > 0``."""
+    """Cost of running at a bus power over one step: fuel without start fuel [kg], or the shaped
+    rewards' part of it. ``engine_on`` defaults to ``engine_power_w > 0``."""
     engine = params.engine
     crank_w = to_crank_w(params.generator, engine_power_w, engine.power_max_w)
     if config.kind == "piecewise":
         return -piecewise_reward(engine, crank_w)
-    return fuel_rate_kg_per_s(engine, crank_w, engine_on) * params.dt_s
+    fuel_kg = fuel_rate_kg_per_s(engine, crank_w, engine_on) * params.dt_s
+    if config.kind == "piecewise_corrected":
+        return fuel_kg / best_fuel_kg(params) + band_penalty(crank_w)
+    return fuel_kg
 
 
 def start_cost(config: RewardConfig, params: PowertrainParams) -> float:
-    """Cost of one engine start [kg]; the shaped reward knows none."""
+    """Cost of one engine start, in the unit of :func:`running_cost`; the printed shaped reward
+    knows none."""
     if config.kind == "piecewise":
         return 0.0
     if config.kind == "fuel":
         return params.engine.start_fuel_kg
+    if config.kind == "piecewise_corrected":
+        return params.engine.start_fuel_kg / best_fuel_kg(params)
     return max(params.engine.start_fuel_kg, config.start_price_kg)
 
 
@@ -156,7 +187,8 @@ def battery_price(
     soc_next: FloatArray,
     soc_target: FloatArray,
 ) -> FloatArray:
-    """Phi(SOC) - Phi(SOC'): the price of the battery energy a step took [kg].
+    """Phi(SOC) - Phi(SOC'): the price of the battery energy a step took, in the unit of
+    :func:`running_cost` ([kg], or [kg] over the best point's fuel for the corrected reward).
 
     With e = SOC - SOC_target and lambda(SOC) = lambda0 (1 - kp e), the potential is its integral,
 
@@ -164,9 +196,9 @@ def battery_price(
 
     so over a run the prices telescope to Phi(SOC_0) - Phi(SOC_T): runs that end at one SOC are
     ordered by their fuel alone. Under a discount gamma a share (1 - gamma) Phi(SOC') stays in
-    every step, which is what holds SOC at the target. Zero for the other rewards.
+    every step, which is what holds SOC at the target. Zero for ``fuel`` and ``piecewise``.
     """
-    if config.kind != "equivalent_fuel":
+    if config.kind in ("fuel", "piecewise"):
         return np.zeros(np.broadcast_shapes(np.shape(soc), np.shape(soc_next)))
     lambda0 = config.lambda0_kg_per_j
     if lambda0 is None:
@@ -176,7 +208,7 @@ def battery_price(
     price: FloatArray = (
         params.battery.energy_j * lambda0 * (soc - soc_next) * (1.0 - config.kp * error)
     )
-    return price
+    return price / best_fuel_kg(params) if config.kind == "piecewise_corrected" else price
 
 
 def step_reward(
@@ -200,10 +232,16 @@ def step_reward(
         soc, soc_next, soc_target: fractions.
 
     Returns:
-        Shape of the arguments; [kg] negative for the fuel rewards.
+        Shape of the arguments; [kg] negative for the fuel rewards. Divided by
+        ``RewardConfig.cost_unit`` it is what a learner sees.
     """
+    power_w = np.where(engine_on, engine_power_w, 0.0)
     if config.kind == "piecewise":
-        return -running_cost(config, params, np.where(engine_on, engine_power_w, 0.0))
+        return -running_cost(config, params, power_w)
+    if config.kind == "piecewise_corrected":
+        crank_w = to_crank_w(params.generator, power_w, params.engine.power_max_w)
+        price = battery_price(config, params, soc, soc_next, soc_target)
+        return -(fuel_kg / best_fuel_kg(params) + band_penalty(crank_w) + price)
     extra_kg = start_cost(config, params) - params.engine.start_fuel_kg
     cost_kg = fuel_kg + np.where(engine_started, extra_kg, 0.0)
     reward: FloatArray = -(cost_kg + battery_price(config, params, soc, soc_next, soc_target))
