@@ -92,16 +92,16 @@ def solve(
         CycleError: the demand is empty or not finite.
     """
     demand_w = np.ascontiguousarray(power_demand_w, dtype=np.float64)
-    _check(params, demand_w, soc_target, soc_initial, soc_points, actions)
+    check_problem(params, demand_w, soc_target, soc_initial, soc_points, actions)
     power_w = battery_power_grid_w(params, actions)
-    soc_move = _soc_moves(params, power_w)
+    soc_move = soc_moves(params, power_w)
     if soc_initial is None:
         row = _window_row(params, soc_target, soc_points)
         soc_grid = np.tile(row, (len(demand_w) + 1, 1))
         landing_soc = np.full(len(demand_w), soc_target)
     else:
         low, high = reachable_soc(params, demand_w, soc_initial, soc_target)
-        soc_grid = _tube_rows(low, high, soc_points)
+        soc_grid = tube_rows(low, high, soc_points)
         landing_soc = high[1:]
     price = terminal_price_kg_per_j(params)
     lb, ub, end_power_w, end_cost_kg = _node_candidates(
@@ -188,7 +188,7 @@ def terminal_price_kg_per_j(params: PowertrainParams) -> float:
     return TERMINAL_MULTIPLE * float(marginal.max())
 
 
-def _check(
+def check_problem(
     params: PowertrainParams,
     demand_w: FloatArray,
     soc_target: float,
@@ -225,21 +225,12 @@ def reachable_soc(
 ) -> tuple[FloatArray, FloatArray]:
     """Lowest and highest SOC at every step, (T + 1,) each, of all runs between the two SOCs; the
     end is the nearest SOC that can be reached where the target cannot."""
-    battery = params.battery
-    lower, upper = battery.soc_min, battery.soc_max
-    power_w = np.linspace(-battery.power_max_w, battery.power_max_w, 1025)
-    moves = _soc_moves(params, power_w)
-    rise = np.interp(demand_w - engine_knots_w(params)[-1], power_w, moves)
-    fall = np.interp(demand_w, power_w, moves)
-    steps = len(demand_w)
-    low, high = np.empty(steps + 1), np.empty(steps + 1)
-    low[0] = high[0] = soc_initial
-    for k in range(steps):
-        low[k + 1] = min(max(low[k] + fall[k], lower), upper)
-        high[k + 1] = min(max(high[k] + rise[k], lower), upper)
+    lower, upper = params.battery.soc_min, params.battery.soc_max
+    fall, rise = _extreme_moves(params, demand_w)
+    low, high = soc_tube(params, demand_w, soc_initial)
     from_low = from_high = min(max(soc_target, low[-1]), high[-1])
     low[-1] = high[-1] = from_low
-    for k in range(steps - 1, -1, -1):
+    for k in range(len(demand_w) - 1, -1, -1):
         # At a limit the battery takes or gives less, so from there the limit itself is reached.
         from_low = max(from_low - rise[k], lower) if from_low > lower else lower
         from_high = min(from_high - fall[k], upper) if from_high < upper else upper
@@ -247,7 +238,32 @@ def reachable_soc(
     return low, np.maximum(low, high)
 
 
-def _tube_rows(low: FloatArray, high: FloatArray, soc_points: int) -> FloatArray:
+def soc_tube(
+    params: PowertrainParams, demand_w: FloatArray, soc_initial: float
+) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest SOC at every step, (T + 1,) each, of all runs from one SOC."""
+    lower, upper = params.battery.soc_min, params.battery.soc_max
+    fall, rise = _extreme_moves(params, demand_w)
+    low, high = np.empty(len(demand_w) + 1), np.empty(len(demand_w) + 1)
+    low[0] = high[0] = soc_initial
+    for k in range(len(demand_w)):
+        low[k + 1] = min(max(low[k] + fall[k], lower), upper)
+        high[k + 1] = min(max(high[k] + rise[k], lower), upper)
+    return low, high
+
+
+def _extreme_moves(
+    params: PowertrainParams, demand_w: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """SOC change of every step with the engine off and at its maximum, limits aside."""
+    power_max_w = params.battery.power_max_w
+    power_w = np.linspace(-power_max_w, power_max_w, 1025)
+    moves = soc_moves(params, power_w)
+    fall = np.interp(demand_w, power_w, moves)
+    return fall, np.interp(demand_w - engine_knots_w(params)[-1], power_w, moves)
+
+
+def tube_rows(low: FloatArray, high: FloatArray, soc_points: int) -> FloatArray:
     """Even nodes from low to high at every step, and one more just outside at either end: below,
     its slope prices what cannot reach the target; above, SOC that can only end beyond it."""
     width = np.maximum(high - low, NODE_GAP)
@@ -277,26 +293,34 @@ def _node_candidates(
     shortfall_price_kg_per_j: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """lb and ub (T, N) of every node, and the candidates made for it with their cost (3, T, N):
-    lb, ub, and what lands on ``landing_soc``.
+    lb, ub, and what lands on ``landing_soc``. Shortfall is priced."""
+    lb, ub, ends, short_w = end_powers_w(params, demand_w, soc_grid)
+    landing = landing_power_w(params, soc_grid[:-1], landing_soc[:, None])
+    power = np.concatenate([ends, landing[None]])
+    cost = engine_fuel_kg(params, demand_w[:, None] - power)
+    cost += shortfall_price_kg_per_j * params.dt_s * short_w
+    cost[2] = np.where((lb <= landing) & (landing <= ub), cost[2], np.inf)
+    return lb, ub, power, cost
+
+
+def end_powers_w(
+    params: PowertrainParams, demand_w: FloatArray, soc_grid: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """lb and ub (T, N) of every node, both again as candidates (2, T, N), and the demand that
+    nothing can meet (T, N) [W].
 
     Where lb > ub no choice is left, and both ends become what the plant then does: everything
-    for the load, with the shortfall priced, or braking into the battery.
+    for the load, or braking into the battery.
     """
-    battery = params.battery
     demand = demand_w[:, None]
-    charge_w, discharge_w = _battery.power_limits_w(battery, soc_grid[:-1], params.dt_s)
+    charge_w, discharge_w = _battery.power_limits_w(params.battery, soc_grid[:-1], params.dt_s)
     engine_max_w = engine_knots_w(params)[-1]
     lb = np.maximum(-charge_w, demand - engine_max_w)
     ub = np.minimum(discharge_w, demand)
     short_w = np.maximum(demand - engine_max_w - discharge_w, 0.0)
-    stuck = lb > ub
     only = np.where(short_w > 0.0, discharge_w, -charge_w)
-    landing = landing_power_w(params, soc_grid[:-1], landing_soc[:, None])
-    power = np.stack([np.where(stuck, only, lb), np.where(stuck, only, ub), landing])
-    cost = engine_fuel_kg(params, demand - power)
-    cost += shortfall_price_kg_per_j * params.dt_s * short_w
-    cost[2] = np.where((lb <= landing) & (landing <= ub), cost[2], np.inf)
-    return lb, ub, power, cost
+    ends = np.where(lb > ub, only, np.stack([lb, ub]))
+    return lb, ub, ends, short_w
 
 
 def landing_power_w(
@@ -306,7 +330,7 @@ def landing_power_w(
     return (soc - soc_after) * params.battery.energy_j / params.dt_s
 
 
-def _soc_moves(params: PowertrainParams, power_w: FloatArray) -> FloatArray:
+def soc_moves(params: PowertrainParams, power_w: FloatArray) -> FloatArray:
     """SOC change of each power, shape (A,): a lossless battery moves alike from every SOC.
 
     Discharging is taken from the window's top and charging from its bottom, where neither meets
