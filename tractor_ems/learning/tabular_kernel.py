@@ -2,6 +2,9 @@
 
 Arrays and numbers only; ``learning.tabular`` holds them and is what others call. ``td_update``
 knows no plant, so tests run the same update on decision processes whose Q* is known.
+
+numba's cache looks at a function's own file only: after a change of ``mdp`` or ``tabular_pairs``
+touch this file too, or what is compiled here still holds the old ones.
 """
 
 from typing import NamedTuple
