@@ -45,7 +45,7 @@ def paper(
     from tractor_ems.study.report import write_report
     from tractor_ems.study.schedule import workers_of
     from tractor_ems.study.study import run_study
-    from tractor_ems.study.tables import all_tables
+    from tractor_ems.study.tables import build_tables, to_json
 
     config = load_study(settings, preset)
     with _stages() as stage:
@@ -53,9 +53,9 @@ def paper(
     target = report or out / preset / "reproduction.md"
     NOTES.print(f"tables and figures: {target}")
     write_report(results, target, target.with_suffix(""))
-    tables = all_tables(results)
+    tables = build_tables(results)
     if json:
-        print_json({"report": str(target), "tables": [table.to_json() for table in tables]})
+        print_json({"report": str(target), "tables": [to_json(table) for table in tables]})
         return
     for table in tables:
         print_table(table.title, table.columns, table.rows)

@@ -280,7 +280,7 @@ def _greedy(
     bounds = np.array([first, last], np.int16)
     forward(net, row.reshape(1, -1), single.layers, tanh)
     best_actions(net, single.layers[-1], bounds[:1], bounds[1:], 1, single)
-    return single.chosen[0]
+    return int(single.chosen[0])
 
 
 @njit(cache=True, error_model="numpy")

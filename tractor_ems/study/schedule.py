@@ -10,7 +10,6 @@ import signal
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeAlias
 
@@ -26,13 +25,6 @@ Progress: TypeAlias = Callable[[int, Sequence[float]], None]
 
 _shared: dict[str, Any] = {}
 """What a worker was given at its start: the stop flag and everybody's progress."""
-
-
-@dataclass(frozen=True)
-class Job:
-    """One piece of work: a bag to record or a run to train."""
-
-    work: Demonstration | Task
 
 
 def workers_of(requested: int | None) -> int:
