@@ -1,22 +1,29 @@
-"""DQN and double DQN: the update against things that are known by hand or by value iteration."""
+"""The sampled learner: what it reaches, when it moves its target net, and what it does without."""
 
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from tractor_ems.learning.config import SampledConfig
-from tractor_ems.learning.dqn import SampledLearner, td_target, td_update
-from tractor_ems.learning.networks import Net, copy_towards, to_numpy
+from tractor_ems.learning.checkpoint import checkpoint_path
+from tractor_ems.learning.config import SampledConfig, load_train_config
+from tractor_ems.learning.dqn import SampledLearner
+from tractor_ems.learning.networks import Net, to_numpy
+from tractor_ems.learning.recordings import Recordings
 from tractor_ems.learning.replay import Replay, Transitions
+from tractor_ems.learning.train import train_on
 from tractor_ems.policies.mlp import forward
+from tractor_msgs_py.errors import RunAborted
 
 MODES = pytest.mark.parametrize("double", [True, False], ids=["double", "single"])
 
 
 def transitions(rows: list[tuple[int, int, float, float, int, int, int]], states: int):
-    """(state, action, reward, discount, next state, first, last) with one-hot inputs."""
+    """(state, action, reward, discount, next state, next first, next last), one-hot inputs."""
     state, action, reward, discount, following, first, last = zip(*rows, strict=True)
     eye = np.eye(states, dtype=np.float32)
     return Transitions(
@@ -25,41 +32,18 @@ def transitions(rows: list[tuple[int, int, float, float, int, int, int]], states
         reward=np.array(reward, dtype=np.float32),
         discount=np.array(discount, dtype=np.float32),
         next_inputs=eye[list(following)],
+        first=np.zeros(len(rows), dtype=np.int16),
+        last=np.zeros(len(rows), dtype=np.int16),
         next_first=np.array(first, dtype=np.int16),
         next_last=np.array(last, dtype=np.int16),
     )
 
 
-def table_net(q: list[list[float]]) -> Net:
-    """A net without hidden layer whose output for one-hot state s is q[s]."""
-    net = Net((len(q), len(q[0])), "relu", np.random.default_rng(0))
-    with torch.no_grad():
-        net.weights[0].copy_(torch.tensor(q).T)
-        net.biases[0].zero_()
-    return net
-
-
-def test_double_target_by_hand_on_two_actions():
-    """Online prefers action 1, target values it 3 although it values action 0 at 7."""
-    online, target = table_net([[1.0, 2.0]]), table_net([[7.0, 3.0]])
-    batch = transitions([(0, 0, 0.5, 0.9, 0, 0, 1)], 1)
-    assert td_target(online, target, batch, double=True).item() == pytest.approx(0.5 + 0.9 * 3.0)
-    assert td_target(online, target, batch, double=False).item() == pytest.approx(0.5 + 0.9 * 7.0)
-
-
-@MODES
-def test_target_never_bootstraps_from_an_infeasible_action(double: bool):
-    """The best feasible action is worth 2, an infeasible one 100, in both nets."""
-    net = table_net([[100.0, 1.0, 2.0, 100.0]])
-    batch = transitions([(0, 1, 0.0, 1.0, 0, 1, 2)], 1)
-    assert td_target(net, net, batch, double=double).item() == 2.0
-
-
-@MODES
-def test_a_terminal_step_has_no_bootstrap(double: bool):
-    net = table_net([[5.0, 6.0]])
-    batch = transitions([(0, 0, -1.5, 0.0, 0, 0, 1)], 1)
-    assert td_target(net, net, batch, double=double).item() == -1.5
+def learner_of(rows: Transitions, actions: int, config: SampledConfig) -> SampledLearner:
+    replay = Replay(100, rows.inputs.shape[1])
+    replay.add(rows)
+    rngs = (np.random.default_rng(0), np.random.default_rng(1))
+    return SampledLearner(rows.inputs.shape[1], actions, config, replay, *rngs)
 
 
 STATES, ACTIONS, GAMMA = 6, 4, 0.8
@@ -91,156 +75,155 @@ def value_iteration(mdp) -> np.ndarray:
 
 
 @MODES
-def test_learner_reaches_q_star_of_a_small_mdp(double: bool):
-    mdp = random_mdp(3)
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_learner_reaches_q_star_of_a_small_mdp_within_1_percent(double: bool, seed: int):
+    """Every state has infeasible actions, which are never tried: what the network says of them
+    is anything, and must not matter."""
+    mdp = random_mdp(seed)
     reward, following, first, last = mdp
     rows = [
         (s, a, reward[s, a], GAMMA, n := int(following[s, a]), int(first[n]), int(last[n]))
         for s in range(STATES)
         for a in range(first[s], last[s] + 1)
     ]
-    replay = Replay(100, STATES)
-    replay.add(transitions(rows, STATES))
     config = SampledConfig(
-        updates=1500, batch=32, learning_rate=5e-3, target_rate=0.1, hidden=(32,), double=double
+        updates=6000, batch=32, learning_rate=5e-3, target_rate=0.1, hidden=(32,), double=double
     )
-    learner = SampledLearner(
-        STATES, ACTIONS, config, replay, np.random.default_rng(0), np.random.default_rng(1)
-    )
+    learner = learner_of(transitions(rows, STATES), ACTIONS, config)
     for _ in range(config.updates):
         learner.update()
     learned = forward(learner.network(), np.eye(STATES, dtype=np.float32))
     q_star = value_iteration(mdp)
     known = np.isfinite(q_star)
-    assert np.abs(learned - q_star)[known].max() < 0.05
+    assert not known.all(axis=1).all()
+    assert np.abs(learned - q_star)[known].max() < 0.01 * np.abs(q_star[known]).max()
     assert q_star[0, 2] > q_star[0, 1]
     assert learned[0, 2] > learned[0, 1], "fell into the myopic trap"
 
 
-@MODES
-def test_updates_equal_a_plain_reference(double: bool):
-    """Loops and float64 against gathered rows and float32, to 1e-6 after three updates."""
-    rng = np.random.default_rng(5)
-    online = Net((3, 8, 8, 5), "relu", rng)
-    target = Net((3, 8, 8, 5), "relu", rng)
-    batch = Transitions(
-        inputs=rng.normal(size=(16, 3)).astype(np.float32),
-        action=rng.integers(0, 5, 16),
-        reward=(3 * rng.normal(size=16)).astype(np.float32),
-        discount=np.full(16, 0.9, np.float32),
-        next_inputs=rng.normal(size=(16, 3)).astype(np.float32),
-        next_first=rng.integers(0, 2, 16).astype(np.int16),
-        next_last=rng.integers(2, 5, 16).astype(np.int16),
-    )
-    optimiser = torch.optim.SGD(online.parameters(), lr=0.05)
-    w = [p.detach().numpy().astype(np.float64) for p in online.weights]
-    b = [p.detach().numpy().astype(np.float64) for p in online.biases]
-    frozen = (
-        [p.detach().numpy().astype(np.float64) for p in target.weights],
-        [p.detach().numpy().astype(np.float64) for p in target.biases],
-    )
-    for _ in range(3):
-        td_update(online, target, optimiser, batch, double=double)
-        w, b = reference_update(w, b, *frozen, batch, double, 0.05)
-    for got, expected in zip(to_numpy(online).weights, w, strict=True):
-        assert np.abs(got - expected).max() < 1e-6
-    for got, expected in zip(to_numpy(online).biases, b, strict=True):
-        assert np.abs(got - expected).max() < 1e-6
-
-
-def reference_update(w, b, w_target, b_target, batch, double, rate):
-    """One plain SGD step of (double) DQN with a Huber loss, one sample at a time."""
-
-    def layers(weights, biases, x):
-        hidden = [x]
-        for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
-            hidden.append(np.maximum(weight @ hidden[-1] + bias, 0.0))
-        return hidden, weights[-1] @ hidden[-1] + biases[-1]
-
-    grad_w, grad_b = [np.zeros_like(x) for x in w], [np.zeros_like(x) for x in b]
-    count = len(batch)
-    for i in range(count):
-        _, q_next_target = layers(w_target, b_target, batch.next_inputs[i].astype(np.float64))
-        chooser = q_next_target
-        if double:
-            _, chooser = layers(w, b, batch.next_inputs[i].astype(np.float64))
-        feasible = range(batch.next_first[i], batch.next_last[i] + 1)
-        best = max(feasible, key=lambda a: chooser[a])
-        y = batch.reward[i] + batch.discount[i] * q_next_target[best]
-        hidden, q = layers(w, b, batch.inputs[i].astype(np.float64))
-        delta = np.zeros(len(q))
-        delta[batch.action[i]] = np.clip(q[batch.action[i]] - y, -1.0, 1.0) / count
-        for number in reversed(range(len(w))):
-            grad_w[number] += np.outer(delta, hidden[number])
-            grad_b[number] += delta
-            delta = (w[number].T @ delta) * (hidden[number] > 0.0)
-    return (
-        [x - rate * g for x, g in zip(w, grad_w, strict=True)],
-        [x - rate * g for x, g in zip(b, grad_b, strict=True)],
-    )
-
-
-def test_double_overestimates_less_on_a_noisy_bandit():
-    """State 0 leads to a bandit of ten arms that pay noise of mean 0: Q(0, .) is 0."""
-    learned = {}
-    for double in (True, False):
-        rng = np.random.default_rng(7)
-        online, target = Net((2, 10), "relu", rng), Net((2, 10), "relu", rng)
-        copy_towards(target, online, 1.0)
-        optimiser = torch.optim.SGD(online.parameters(), lr=0.5)
-        seen = []
-        for step in range(1500):
-            rows = [(0, 0, 0.0, 0.9, 1, 0, 9)]
-            rows += [(1, arm, rng.normal(), 0.0, 1, 0, 9) for arm in range(10)]
-            td_update(online, target, optimiser, transitions(rows, 2), double=double, loss="mse")
-            if step % 50 == 49:
-                copy_towards(target, online, 1.0)
-            if step >= 300:
-                seen.append(forward(to_numpy(online), np.eye(2, dtype=np.float32))[0, 0])
-        learned[double] = float(np.mean(seen))
-    assert learned[False] > 0.1
-    assert abs(learned[True]) < 0.5 * learned[False]
-
-
-def test_hard_target_updates_copy_and_soft_ones_approach():
-    rng = np.random.default_rng(0)
-    online, target = Net((2, 3), "relu", rng), Net((2, 3), "relu", rng)
-    before = to_numpy(target).weights[0]
-    copy_towards(target, online, 0.25)
-    expected = before + np.float32(0.25) * (to_numpy(online).weights[0] - before)
-    assert np.allclose(to_numpy(target).weights[0], expected, atol=1e-7)
-    copy_towards(target, online, 1.0)
-    assert np.array_equal(to_numpy(target).weights[0], to_numpy(online).weights[0])
-
-
 def test_target_net_moves_only_when_it_is_due():
-    replay = Replay(10, 2)
-    replay.add(transitions([(0, 0, 1.0, 0.9, 1, 0, 1)], 2))
-    config = replace(SampledConfig(), hidden=(4,), target_every=3, target_rate=1.0, batch=4)
-    learner = SampledLearner(
-        2, 2, config, replay, np.random.default_rng(0), np.random.default_rng(1)
-    )
-    first = to_numpy(learner.target).weights[0]
+    config = SampledConfig(hidden=(4,), target_every=3, target_rate=1.0, batch=4)
+    learner = learner_of(transitions([(0, 0, 1.0, 0.9, 1, 0, 1)], 2), 2, config)
+    before = learner.target.flat.copy()
+    assert np.array_equal(before, learner.online.flat), "the nets start equal"
     for _ in range(2):
         learner.update()
-    assert np.array_equal(to_numpy(learner.target).weights[0], first)
+    assert np.array_equal(learner.target.flat, before)
     learner.update()
-    assert np.array_equal(to_numpy(learner.target).weights[0], learner.network().weights[0])
+    assert np.array_equal(learner.target.flat, learner.online.flat)
+    assert not np.array_equal(learner.target.flat, before)
+
+
+@pytest.mark.parametrize("loss", ["huber", "mse"])
+def test_the_loss_that_is_reported_is_that_of_the_setting(loss: str):
+    """An error of 3: 2.5 by Huber, 4.5 by half its square."""
+    config = SampledConfig(hidden=(4,), batch=2, loss=loss, learning_rate=1e-9)
+    learner = learner_of(transitions([(0, 0, 0.0, 0.0, 1, 0, 1)], 2), 2, config)
+    q = forward(learner.network(), np.eye(2, dtype=np.float32))[0, 0]
+    learner.replay.columns["reward"][:] = q + 3.0
+    metrics = learner.update()
+    assert metrics["losses/td_loss"] == pytest.approx(2.5 if loss == "huber" else 4.5, rel=1e-5)
+    assert metrics["losses/q_values"] == pytest.approx(q, rel=1e-5)
+
+
+def test_a_restored_learner_goes_on_to_the_same_bytes():
+    """One run unbroken, the other continued by a learner that was made from another seed."""
+    config = SampledConfig(hidden=(8, 8), batch=8, activation="tanh", target_every=5)
+    rows = transitions([(s, s % 3, s * 0.5, 0.9, 5 - s, 0, s % 3) for s in range(6)], 6)
+    whole, second = learner_of(rows, 3, config), learner_of(rows.take(np.array([0])), 3, config)
+    for _ in range(17):
+        whole.update()
+    tensors = {name: value.copy() for name, value in whole.tensors().items()}
+    second.restore(tensors, whole.state())
+    for learner in (whole, second):
+        for _ in range(13):
+            learner.update()
+    for name, value in whole.tensors().items():
+        assert value.tobytes() == second.tensors()[name].tobytes(), name
+
+
+def test_the_network_of_a_policy_is_a_copy():
+    config = SampledConfig(hidden=(4,), batch=4)
+    learner = learner_of(transitions([(0, 0, 1.0, 0.9, 1, 0, 1)], 2), 2, config)
+    network = learner.network()
+    before = [w.tobytes() for w in network.weights]
+    learner.update()
+    assert [w.tobytes() for w in network.weights] == before
+    assert [w.tobytes() for w in learner.network().weights] != before
 
 
 @pytest.mark.parametrize("activation", ["relu", "tanh"])
-def test_torch_and_numpy_forward_passes_agree(activation):
-    net = Net((5, 64, 64, 1600), activation, np.random.default_rng(2))
+def test_torch_numpy_and_compiled_nets_start_alike(activation):
+    """One generator draws one net, whoever trains it."""
+    config = SampledConfig(hidden=(64, 64), activation=activation)
+    learner = learner_of(transitions([(0, 0, 1.0, 0.9, 1, 0, 1)], 5), 1600, config)
+    net = Net((5, 64, 64, 1600), activation, np.random.default_rng(0))
     inputs = np.random.default_rng(3).normal(size=(32, 5)).astype(np.float32)
-    numpy_q = forward(to_numpy(net), inputs)
     torch_q = net(torch.from_numpy(inputs)).detach().numpy()
-    assert numpy_q.dtype == np.float32
-    assert np.abs(numpy_q - torch_q).max() < 1e-6
+    for mlp in (to_numpy(net), learner.network()):
+        q = forward(mlp, inputs)
+        assert q.dtype == np.float32
+        assert np.abs(q - torch_q).max() < 1e-6
 
 
-def test_gathered_outputs_equal_the_dense_head():
-    net = Net((5, 16, 40), "relu", np.random.default_rng(2))
-    inputs = torch.from_numpy(np.random.default_rng(3).normal(size=(8, 5)).astype(np.float32))
-    chosen = torch.arange(8) * 5
-    dense = net(inputs).gather(1, chosen[:, None])[:, 0]
-    assert torch.allclose(net.at(inputs, chosen), dense, atol=1e-6)
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e38])
+def test_a_diverged_run_is_aborted_and_leaves_nothing(
+    value: float, paper, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    config = load_train_config(
+        "sampled", {"updates": 20, "sampled.hidden": [8], "sampled.batch": 8, "interact": 1}
+    )
+    update = SampledLearner.update
+
+    def poison(learner: SampledLearner):
+        if learner.step == 6:
+            learner.online.flat[:] = value
+        return update(learner)
+
+    monkeypatch.setattr(SampledLearner, "update", poison)
+    out = tmp_path / "p.safetensors"
+    with pytest.raises(RunAborted, match="diverged at update 7: loss is"):
+        train_on(config, paper, Recordings(dp=(), rule=()), out)
+    assert not out.exists() and not checkpoint_path(out).exists()
+
+
+NO_TORCH = """
+import sys
+from pathlib import Path
+sys.modules["torch"] = None
+from tractor_ems.learning.config import load_train_config
+from tractor_ems.learning.recordings import Recordings
+from tractor_ems.learning.train import train_on
+from tractor_msgs_py.errors import ConfigError
+from tractor_sim.config import load_powertrain
+for preset in ("sampled", "counterfactual"):
+    config = load_train_config(preset, {"updates": 5, "interact": 1, "sampled.hidden": [8]})
+    out, nothing = Path(sys.argv[1]) / "p.safetensors", Recordings(dp=(), rule=())
+    try:
+        print(train_on(config, load_powertrain("paper"), nothing, out).updates)
+    except ConfigError as error:
+        print(error)
+"""
+
+
+def test_torch_is_needed_for_counterfactual_targets_alone(tmp_path: Path):
+    done = subprocess.run(
+        [sys.executable, "-c", NO_TORCH, str(tmp_path)],
+        text=True,
+        capture_output=True,
+        timeout=240,
+    )
+    trained, refused = done.stdout.splitlines() or [done.stderr, ""]
+    assert trained == "5"
+    assert refused.startswith("targets counterfactual: training needs torch: pip install")
+
+
+def test_another_seed_of_sampling_changes_the_batches():
+    rows = transitions([(s, 0, float(s), 0.0, 0, 0, 1) for s in range(6)], 6)
+    config = SampledConfig(hidden=(4,), batch=4)
+    first, second = learner_of(rows, 2, config), learner_of(rows, 2, replace(config))
+    second.rng = np.random.default_rng(99)
+    for learner in (first, second):
+        for _ in range(5):
+            learner.update()
+    assert first.online.flat.tobytes() != second.online.flat.tobytes()

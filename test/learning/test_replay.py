@@ -32,6 +32,8 @@ def numbered(count: int, begin: int = 0) -> Transitions:
         reward=number.astype(np.float32),
         discount=np.full(count, 0.9, np.float32),
         next_inputs=np.zeros((count, 2), np.float32),
+        first=np.zeros(count, np.int16),
+        last=np.full(count, 5, np.int16),
         next_first=np.zeros(count, np.int16),
         next_last=np.full(count, 5, np.int16),
     )

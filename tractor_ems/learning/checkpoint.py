@@ -15,7 +15,7 @@ from safetensors.numpy import save
 from tractor_msgs_py.atomic import write_bytes
 from tractor_msgs_py.errors import ConfigError
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 _KEY = "tractor_ems.checkpoint"
 
 

@@ -71,7 +71,7 @@ class SampledConfig:
         target_rate: soft update per step; 1 with ``target_every`` above 1 is a hard copy.
         target_every: updates between target updates.
         double: double DQN; False is plain DQN.
-        loss: on the temporal difference in reward units.
+        loss: on the temporal difference in reward units; ``mse`` is half its square here.
         hidden, activation: of the network; its head has one output per action.
         replay_capacity: transitions in the FIFO.
         dp_share, rule_share: share of the capacity seeded from DP and rule-based bags.

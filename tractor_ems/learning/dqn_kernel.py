@@ -11,14 +11,17 @@ With 1600 outputs the head is all of the cost. Forward, only feasible actions ar
 tiles that stay in a near cache; backward, only the chosen action's column has a gradient.
 """
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from tractor_ems.policies.mlp import Float32Array
+from tractor_msgs_py.trajectory import IntArray
 
 FAST = {"reassoc", "contract", "nsz", "arcp"}
 """Sums may be reordered, which vectorises them; NaN and infinity keep their meaning."""
@@ -27,7 +30,7 @@ TILE = 256
 """Head outputs at a time: 64 inputs by 256 outputs of float32 are 64 KB, near the core."""
 
 ROWS = 4
-"""Samples at a time in a product, as :func:`_affine` is written out for."""
+"""Samples at a time in a product, as it is written out; a workspace has whole fours of rows."""
 
 TINY = 1e-30
 """Moments below this become zero: an action that is never taken would else decay into
@@ -37,16 +40,15 @@ BETA1, BETA2, ADAM_EPS = 0.9, 0.999, 1e-8
 
 
 class QNet(NamedTuple):
-    """Fully connected layers as views of one flat vector.
+    """Fully connected layers in one flat vector, so that one compiled update serves any depth.
 
     Attributes:
-        flat: every parameter, shape (P,).
-        weights: by layer, shape (inputs, outputs); biases: shape (1, outputs).
+        flat: every parameter, shape (P,); by layer weights (inputs, outputs), then biases.
+        sizes: widths from input to output, shape (layers + 1,).
     """
 
     flat: Float32Array
-    weights: tuple[Float32Array, ...]
-    biases: tuple[Float32Array, ...]
+    sizes: IntArray
 
 
 class Adam(NamedTuple):
@@ -95,41 +97,45 @@ class Rule(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """Room for one batch: activations by layer (input first), their gradients, action values."""
+    """Room for one batch, its rows rounded up to a multiple of ROWS.
 
-    layers: tuple[Float32Array, ...]
-    next_layers: tuple[Float32Array, ...]
-    slopes: tuple[Float32Array, ...]
+    Attributes:
+        layers, next_layers: activations in the state and the next one, input first, shape
+            (layers, rows, largest width).
+        slopes: the loss's slope in ``layers``.
+        values, folded: action values of a tile, and room to search them.
+        best, chosen: value and index of the best feasible action, shape (batch,).
+    """
+
+    layers: Float32Array
+    next_layers: Float32Array
+    slopes: Float32Array
     values: Float32Array
+    folded: Float32Array
     best: Float32Array
     chosen: NDArray[np.int64]
 
 
-def net_of(sizes: tuple[int, ...], flat: Float32Array) -> QNet:
-    """Views of a flat parameter vector, shape (parameters(sizes),)."""
-    weights, biases, at = [], [], 0
-    for inputs, outputs in pairwise(sizes):
-        weights.append(flat[at : at + inputs * outputs].reshape(inputs, outputs))
-        at += inputs * outputs
-        biases.append(flat[at : at + outputs].reshape(1, outputs))
-        at += outputs
-    return QNet(flat, tuple(weights), tuple(biases))
+def net_of(sizes: Sequence[int], flat: Float32Array) -> QNet:
+    """The net of a flat parameter vector, shape (parameters(sizes),); not a copy."""
+    return QNet(flat, np.array(sizes, np.int64))
 
 
-def parameters(sizes: tuple[int, ...]) -> int:
+def parameters(sizes: Sequence[int]) -> int:
     """Number of weights and biases."""
     return sum((a + 1) * b for a, b in pairwise(sizes))
 
 
-def zero_net(sizes: tuple[int, ...]) -> QNet:
+def zero_net(sizes: Sequence[int]) -> QNet:
     """All zero."""
     return net_of(sizes, np.zeros(parameters(sizes), np.float32))
 
 
-def random_net(sizes: tuple[int, ...], rng: np.random.Generator) -> QNet:
+def random_net(sizes: Sequence[int], rng: np.random.Generator) -> QNet:
     """Weights and biases uniform in +-1/sqrt(inputs), drawn from ``rng``."""
     net = zero_net(sizes)
-    for weight, bias in zip(net.weights, net.biases, strict=True):
+    for n in range(len(sizes) - 1):
+        weight, bias = layer(net, n)
         bound = len(weight) ** -0.5
         # Drawn output by output, the order in which networks.Net draws.
         weight[:] = rng.uniform(-bound, bound, weight.shape[::-1]).astype(np.float32).T
@@ -137,23 +143,41 @@ def random_net(sizes: tuple[int, ...], rng: np.random.Generator) -> QNet:
     return net
 
 
-def make_adam(sizes: tuple[int, ...]) -> Adam:
+@register_jitable
+def layer(net: QNet, n: int) -> tuple[Float32Array, Float32Array]:
+    """Views of the weights (inputs, outputs) and biases (outputs,) of layer ``n`` from 0."""
+    at = 0
+    for m in range(n):
+        at += (net.sizes[m] + 1) * net.sizes[m + 1]
+    inputs, outputs = net.sizes[n], net.sizes[n + 1]
+    middle = at + inputs * outputs
+    weight = net.flat[at:middle].reshape(inputs, outputs)
+    return weight, net.flat[middle : middle + outputs]
+
+
+@register_jitable
+def head(net: QNet) -> tuple[Float32Array, Float32Array]:
+    """The last layer, see :func:`layer`."""
+    return layer(net, len(net.sizes) - 2)
+
+
+def make_adam(sizes: Sequence[int]) -> Adam:
     """At rest."""
     count = parameters(sizes)
     return Adam(zero_net(sizes), np.zeros(count, np.float32), np.zeros(count, np.float32))
 
 
-def make_workspace(sizes: tuple[int, ...], batch: int) -> Workspace:
-    """For batches of ``batch``."""
+def make_workspace(sizes: Sequence[int], batch: int) -> Workspace:
+    """For batches of at most ``batch``."""
+    rows = -(-batch // ROWS) * ROWS
 
-    def layers() -> tuple[Float32Array, ...]:
-        return tuple(np.zeros((batch, width), np.float32) for width in sizes[:-1])
-
+    shape = (len(sizes) - 1, rows, max(sizes[:-1]))
     return Workspace(
-        layers=layers(),
-        next_layers=layers(),
-        slopes=layers(),
-        values=np.zeros((batch, max(TILE, *sizes[:-1])), np.float32),
+        layers=np.zeros(shape, np.float32),
+        next_layers=np.zeros(shape, np.float32),
+        slopes=np.zeros(shape, np.float32),
+        values=np.zeros((rows, TILE), np.float32),
+        folded=np.zeros(TILE, np.float32),
         best=np.zeros(batch, np.float32),
         chosen=np.zeros(batch, np.int64),
     )
@@ -179,7 +203,7 @@ def td_update(
         Mean loss (temporal difference and margin) and mean Q of the batch.
     """
     size = len(batch.action)
-    scale = np.float32(1.0 / size)
+    share = np.float32(1.0 / size)
 
     # y of every transition: its greedy next action, evaluated by the target net.
     if rule.double:
@@ -195,7 +219,7 @@ def td_update(
     # Gradient of the loss at the action taken; the rest of the head has none.
     forward(online, batch.inputs, work.layers, rule.tanh)
     hidden, slope = work.layers[-1], work.slopes[-1]
-    slope[:size] = np.float32(0.0)
+    slope[:] = np.float32(0.0)
     loss, mean_q = 0.0, 0.0
     for b in range(size):
         q = value_of(online, hidden, b, batch.action[b])
@@ -206,7 +230,7 @@ def td_update(
             loss += abs(error) - 0.5
             error = np.float32(1.0) if error > 0.0 else np.float32(-1.0)
         mean_q += q
-        _pull(online, adam.gradient, hidden, slope, b, batch.action[b], error * scale)
+        _pull(online, adam.gradient, hidden, slope, b, batch.action[b], error * share)
     if rule.margin > 0.0 and batch.experts > 0:
         loss += _margin_loss(online, adam.gradient, hidden, slope, work, batch, rule.margin)
     backward(online, adam.gradient, work, batch.inputs, size, rule.tanh)
@@ -215,14 +239,17 @@ def td_update(
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def forward(net: QNet, inputs: Float32Array, layers: tuple[Float32Array, ...], tanh: bool) -> None:
+def forward(net: QNet, inputs: Float32Array, layers: Float32Array, tanh: bool) -> None:
     """Fill ``layers``: the inputs, then every hidden layer's activations."""
     size = len(inputs)
-    layers[0][:size] = inputs
+    for b in range(size):
+        for i in range(inputs.shape[1]):
+            layers[0][b, i] = inputs[b, i]
     for n in range(len(layers) - 1):
-        here, width = layers[n + 1], net.weights[n].shape[1]
-        for b in range(0, size, ROWS):
-            _affine(net.weights[n], net.biases[n], layers[n], b, size, 0, width, here)
+        weight, bias = layer(net, n)
+        here, width = layers[n + 1], len(bias)
+        for block in range(0, size, ROWS):
+            _affine(weight, bias, layers[n], block, 0, width, here)
         for b in range(size):
             row = here[b]
             for j in range(width):
@@ -238,8 +265,25 @@ def best_actions(
     size: int,
     work: Workspace,
 ) -> None:
-    """Fill ``work.chosen`` and ``work.best`` with the best feasible action and its value."""
-    weight, bias, values = net.weights[-1], net.biases[-1], work.values
+    """Fill ``work.chosen`` and ``work.best`` with the best feasible action and its value; of
+    equal ones the first."""
+    _search(net, hidden, first, last, size, work, work.chosen, 0.0)
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _search(
+    net: QNet,
+    hidden: Float32Array,
+    first: NDArray[np.int16],
+    last: NDArray[np.int16],
+    size: int,
+    work: Workspace,
+    origin: NDArray[np.int64],
+    rise: float,
+) -> None:
+    """:func:`best_actions` of Q(s_b, a) + rise |a - origin_b|."""
+    (weight, bias), values = head(net), work.values
+    slant = np.float32(rise)
     for b in range(size):
         work.best[b] = -np.inf
         work.chosen[b] = first[b]
@@ -249,32 +293,42 @@ def best_actions(
             rows = range(block, min(block + ROWS, size))
             low, high = end, begin
             for b in rows:
-                low, high = min(low, np.int64(first[b])), max(high, np.int64(last[b]) + 1)
+                low, high = min(low, int(first[b])), max(high, int(last[b]) + 1)
             low, high = max(low, begin), min(high, end)
             if low >= high:
                 continue
-            _affine(weight, bias, hidden, block, size, low, high, values)
+            _affine(weight, bias, hidden, block, low, high, values)
             for b in rows:
-                start, stop = max(low, np.int64(first[b])), min(high, np.int64(last[b]) + 1)
+                start, stop = max(low, int(first[b])) - low, min(high, int(last[b]) + 1) - low
                 if start >= stop:
                     continue
-                row, most = values[b][start - low : stop - low], work.best[b]
-                most = max(most, _largest(row))
+                row = values[b]
+                if rise > 0.0:
+                    for j in range(high - low):
+                        row[j] += slant * np.float32(abs(low + j - origin[b]))
+                most = _largest(row, start, stop, work.folded)
                 if most > work.best[b]:
-                    j = 0
-                    while j < len(row) - 1 and row[j] != most:
-                        j += 1
+                    while row[start] != most:
+                        start += 1
                     work.best[b] = most
-                    work.chosen[b] = start + j
+                    work.chosen[b] = low + start
 
 
-@njit(cache=True, error_model="numpy", fastmath={*FAST, "nnan"})
-def _largest(values: Float32Array) -> float:
-    """Largest of (N,); vectorised because NaN is left out of account; the loss finds it."""
-    most = values[0]
-    for j in range(len(values)):
-        most = max(most, values[j])
-    return most
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _largest(row: Float32Array, begin: int, end: int, folded: Float32Array) -> float:
+    """Largest of row[begin:end], by halving: one running maximum would not be vectorised."""
+    begin, count = max(begin, 0), end - begin
+    half = (count + 1) // 2
+    for j in range(half):
+        folded[j] = max(row[begin + j], row[begin + count - half + j])
+    while half > 8:
+        count, half = half, (half + 1) // 2
+        for j in range(count - half):
+            folded[j] = max(folded[j], folded[half + j])
+    most = folded[0]
+    for j in range(1, half):
+        most = max(most, folded[j])
+    return float(most)
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
@@ -283,58 +337,51 @@ def _affine(
     bias: Float32Array,
     hidden: Float32Array,
     block: int,
-    size: int,
     low: int,
     high: int,
     out: Float32Array,
 ) -> None:
-    """out[b, :high - low] = outputs low..high - 1 of the ROWS samples from ``block`` on.
+    """out[b, :high - low] = outputs low..high - 1 of the ROWS samples b from ``block`` on.
 
     Four samples share every weight that is loaded, and four inputs every value that is stored.
     """
     begin, block = max(low, 0), max(block, 0)  # what might be negative is not vectorised
     count, width = high - begin, weight.shape[0]
-    for b in range(block, min(block + ROWS, size)):
-        row = out[b]
+    out0, out1, out2, out3 = out[block], out[block + 1], out[block + 2], out[block + 3]
+    in0, in1, in2, in3 = hidden[block], hidden[block + 1], hidden[block + 2], hidden[block + 3]
+    for j in range(count):
+        out0[j] = out1[j] = out2[j] = out3[j] = bias[begin + j]
+    whole = width - width % 4
+    for i in range(0, whole, 4):
+        a0, a1, a2, a3 = in0[i], in0[i + 1], in0[i + 2], in0[i + 3]
+        b0, b1, b2, b3 = in1[i], in1[i + 1], in1[i + 2], in1[i + 3]
+        c0, c1, c2, c3 = in2[i], in2[i + 1], in2[i + 2], in2[i + 3]
+        d0, d1, d2, d3 = in3[i], in3[i + 1], in3[i + 2], in3[i + 3]
         for j in range(count):
-            row[j] = bias[0, begin + j]
-    whole = width - width % 4 if block + ROWS <= size else 0
-    if whole:
-        out0, out1, out2, out3 = out[block], out[block + 1], out[block + 2], out[block + 3]
-        in0, in1, in2, in3 = (
-            hidden[block],
-            hidden[block + 1],
-            hidden[block + 2],
-            hidden[block + 3],
-        )
-        for i in range(0, whole, 4):
-            a0, a1, a2, a3 = in0[i], in0[i + 1], in0[i + 2], in0[i + 3]
-            b0, b1, b2, b3 = in1[i], in1[i + 1], in1[i + 2], in1[i + 3]
-            c0, c1, c2, c3 = in2[i], in2[i + 1], in2[i + 2], in2[i + 3]
-            d0, d1, d2, d3 = in3[i], in3[i + 1], in3[i + 2], in3[i + 3]
-            for j in range(count):
-                k = begin + j
-                w0, w1, w2, w3 = weight[i, k], weight[i + 1, k], weight[i + 2, k], weight[i + 3, k]
-                out0[j] += a0 * w0 + a1 * w1 + a2 * w2 + a3 * w3
-                out1[j] += b0 * w0 + b1 * w1 + b2 * w2 + b3 * w3
-                out2[j] += c0 * w0 + c1 * w1 + c2 * w2 + c3 * w3
-                out3[j] += d0 * w0 + d1 * w1 + d2 * w2 + d3 * w3
-    for b in range(block, min(block + ROWS, size)):
-        row = out[b]
-        for i in range(whole, width):
-            x = hidden[b, i]
-            for j in range(count):
-                row[j] += x * weight[i, begin + j]
+            k = begin + j
+            w0, w1, w2, w3 = weight[i, k], weight[i + 1, k], weight[i + 2, k], weight[i + 3, k]
+            out0[j] += a0 * w0 + a1 * w1 + a2 * w2 + a3 * w3
+            out1[j] += b0 * w0 + b1 * w1 + b2 * w2 + b3 * w3
+            out2[j] += c0 * w0 + c1 * w1 + c2 * w2 + c3 * w3
+            out3[j] += d0 * w0 + d1 * w1 + d2 * w2 + d3 * w3
+    for i in range(whole, width):
+        a0, b0, c0, d0 = in0[i], in1[i], in2[i], in3[i]
+        for j in range(count):
+            w0 = weight[i, begin + j]
+            out0[j] += a0 * w0
+            out1[j] += b0 * w0
+            out2[j] += c0 * w0
+            out3[j] += d0 * w0
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
 def value_of(net: QNet, hidden: Float32Array, b: int, action: int) -> float:
     """Q of one action, without the others."""
-    weight = net.weights[-1]
-    total = net.biases[-1][0, action]
+    weight, bias = head(net)
+    total = bias[action]
     for i in range(weight.shape[0]):
         total += hidden[b, i] * weight[i, action]
-    return total
+    return float(total)
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
@@ -348,8 +395,9 @@ def _pull(
     amount: float,
 ) -> None:
     """Add the gradient of ``amount * Q(s_b, action)`` at the head, and below it to ``slope``."""
-    weight, into = net.weights[-1], gradient.weights[-1]
-    gradient.biases[-1][0, action] += amount
+    weight, _ = head(net)
+    into, into_bias = head(gradient)
+    into_bias[action] += amount
     for i in range(weight.shape[0]):
         into[i, action] += amount * hidden[b, i]
         slope[b, i] += amount * weight[i, action]
@@ -366,24 +414,16 @@ def _margin_loss(
     margin: float,
 ) -> float:
     """max_a [Q(s, a) + margin |a - a_E| / A] - Q(s, a_E) over the experts' transitions."""
-    weight, bias, values = net.weights[-1], net.biases[-1], work.values
-    actions, total = weight.shape[1], 0.0
-    scale, rise = np.float32(1.0 / len(batch.action)), np.float32(margin / actions)
+    total, share = 0.0, np.float32(1.0 / len(batch.action))
+    rise = margin / net.sizes[-1]
+    _search(net, hidden, batch.first, batch.last, batch.experts, work, batch.action, rise)
     for b in range(batch.experts):
-        expert = batch.action[b]
-        own = value_of(net, hidden, b, expert)
-        most, rival = own, expert
-        for begin in range(np.int64(batch.first[b]), np.int64(batch.last[b]) + 1, TILE):
-            end = min(begin + TILE, np.int64(batch.last[b]) + 1)
-            _affine(weight, bias, hidden, b, b + 1, begin, end, values)
-            for j in range(end - begin):
-                value = values[b, j] + rise * abs(begin + j - expert)
-                if value > most:
-                    most, rival = value, begin + j
-        if rival != expert:
-            total += most - own
-            _pull(net, gradient, hidden, slope, b, rival, scale)
-            _pull(net, gradient, hidden, slope, b, expert, -scale)
+        expert, rival = batch.action[b], work.chosen[b]
+        excess = work.best[b] - value_of(net, hidden, b, expert)
+        if rival != expert and excess > 0.0:
+            total += excess
+            _pull(net, gradient, hidden, slope, b, rival, float(share))
+            _pull(net, gradient, hidden, slope, b, expert, -float(share))
     return total
 
 
@@ -391,28 +431,36 @@ def _margin_loss(
 def backward(
     net: QNet, gradient: QNet, work: Workspace, inputs: Float32Array, size: int, tanh: bool
 ) -> None:
-    """From ``work.slopes[-1]``, the loss's slope in the last hidden layer, down to the inputs."""
+    """From ``work.slopes[-1]``, the loss's slope in the last hidden layer, down to the inputs.
+
+    Slopes of the rows beyond ``size`` must be zero."""
+    one, zero = np.float32(1.0), np.float32(0.0)
     for n in range(len(work.layers) - 2, -1, -1):
         below, here = work.layers[n], work.layers[n + 1]
         slope, slope_below = work.slopes[n + 1], work.slopes[n]
-        weight, into, into_bias = net.weights[n], gradient.weights[n], gradient.biases[n]
-        width = weight.shape[1]
+        weight, _ = layer(net, n)
+        into, into_bias = layer(gradient, n)
+        width = len(into_bias)
         for b in range(size):
-            row = slope[b]
+            row, active = slope[b], here[b]
             for j in range(width):
-                h = here[b, j]
-                row[j] *= (
-                    (np.float32(1.0) - h * h)
-                    if tanh
-                    else (np.float32(1.0) if h > 0.0 else np.float32(0.0))
-                )
-                into_bias[0, j] += row[j]
+                h = active[j]
+                row[j] *= (one - h * h) if tanh else (one if h > zero else zero)
+                into_bias[j] += row[j]
+        for b in range(0, size, ROWS):
+            s0, s1, s2, s3 = slope[b], slope[b + 1], slope[b + 2], slope[b + 3]
             for i in range(weight.shape[0]):
-                x, total = below[b, i], np.float32(0.0)
+                x0, x1, x2, x3 = below[b, i], below[b + 1, i], below[b + 2, i], below[b + 3, i]
+                t0, t1, t2, t3 = zero, zero, zero, zero
+                w, g = weight[i], into[i]
                 for j in range(width):
-                    into[i, j] += x * row[j]
-                    total += row[j] * weight[i, j]
-                slope_below[b, i] = total
+                    g[j] += x0 * s0[j] + x1 * s1[j] + x2 * s2[j] + x3 * s3[j]
+                    t0 += w[j] * s0[j]
+                    t1 += w[j] * s1[j]
+                    t2 += w[j] * s2[j]
+                    t3 += w[j] * s3[j]
+                slope_below[b, i], slope_below[b + 1, i] = t0, t1
+                slope_below[b + 2, i], slope_below[b + 3, i] = t2, t3
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
@@ -450,8 +498,9 @@ def move_target(target: QNet, online: QNet, rate: float) -> None:
 
 
 def as_arrays(net: QNet) -> dict[str, Any]:
-    """Weights (outputs, inputs) and biases by layer, as ``policies.mlp`` wants them."""
+    """Weights (outputs, inputs) and biases by layer, as ``policies.mlp`` wants them; copies."""
+    layers = [layer(net, n) for n in range(len(net.sizes) - 1)]
     return {
-        "weights": tuple(np.ascontiguousarray(w.T) for w in net.weights),
-        "biases": tuple(b[0].copy() for b in net.biases),
+        "weights": tuple(np.ascontiguousarray(weight.T) for weight, _ in layers),
+        "biases": tuple(bias.copy() for _, bias in layers),
     }

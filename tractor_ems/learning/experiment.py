@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from tractor_ems.learning.config import SampledConfig, TrainConfig
-from tractor_ems.learning.counterfactual import CounterfactualLearner, make_problem
 from tractor_ems.learning.dqn import SampledLearner
 from tractor_ems.learning.interact import episode, episode_cycles, training_demand_w
 from tractor_ems.learning.recorded import Drive, drive_of_trace, replay_transitions
@@ -126,6 +125,9 @@ class CounterfactualRun:
     because nothing else of a drive is used."""
 
     def __init__(self, experiment: Experiment, generators: Generators) -> None:
+        # Here and not above, because it imports torch, which sampled runs do without.
+        from tractor_ems.learning.counterfactual import CounterfactualLearner, make_problem
+
         config, params = experiment.config, experiment.params
         samples = demand_samples(
             experiment.demands_w, experiment.spec, experiment.scaling, params.dt_s

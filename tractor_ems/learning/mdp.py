@@ -70,9 +70,7 @@ class Mdp(NamedTuple):
     kp: float
 
 
-def action_powers_w(
-    params: PowertrainParams, mapping: ActionMapping, actions: int
-) -> FloatArray:
+def action_powers_w(params: PowertrainParams, mapping: ActionMapping, actions: int) -> FloatArray:
     """Power that each action means, shape (A,) [W].
 
     ``p_batt_grid``: the paper's, ``actions`` battery powers over -P_b,max..P_b,max, clipped to
@@ -161,15 +159,15 @@ def feasible_actions(mdp: Mdp, demand_w: float, lb: float, ub: float) -> tuple[i
     low, high = lb, max(lb, ub)
     if mdp.engine_actions:
         low, high = max(demand_w - max(lb, ub), 0.0), max(demand_w - lb, 0.0)
-    first = min(max(np.searchsorted(power_w, low, side="right") - 1, 0), top)
-    last = min(max(np.searchsorted(power_w, high, side="left"), first), top)
+    first = min(max(int(np.searchsorted(power_w, low, side="right")) - 1, 0), top)
+    last = min(max(int(np.searchsorted(power_w, high, side="left")), first), top)
     return first, last
 
 
 @njit(cache=True, error_model="numpy")
 def battery_power_w(mdp: Mdp, action: int, demand_w: float, lb: float, ub: float) -> float:
     """Battery power of an action, clipped to [lb, ub]; where lb > ub it is lb."""
-    power_w = mdp.action_power_w[action]
+    power_w = float(mdp.action_power_w[action])
     wanted_w = demand_w - power_w if mdp.engine_actions else power_w
     return min(max(wanted_w, lb), max(lb, ub))
 

@@ -57,12 +57,6 @@ class Net:
         """All outputs, shape (B, outputs)."""
         return torch.addmm(self.biases[-1], self.hidden(inputs), self.weights[-1].T)
 
-    def at(self, inputs: Tensor, output: Tensor) -> Tensor:
-        """One chosen output per row, shape (B,), without computing the others: the dense last
-        layer is most of the cost of 1600 actions."""
-        rows = torch.nn.functional.embedding(output, self.weights[-1])
-        return (self.hidden(inputs) * rows).sum(dim=1) + self.biases[-1][output]
-
 
 def to_numpy(net: Net) -> Mlp:
     """A copy for the policies."""

@@ -1,13 +1,13 @@
 """A training run from bags to policy file: the one core behind ``ems train`` and the trainer node.
 
-torch is imported when a run begins, not with this module.
+torch is imported when a counterfactual run begins; sampled ones do without.
 """
 
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
@@ -91,8 +91,8 @@ def train(
 
     Raises:
         BagError: a bag cannot be read or does not fit.
-        ConfigError: nothing to learn from, torch is missing, ``out`` is no name for a policy
-            file, or the checkpoint does not fit.
+        ConfigError: nothing to learn from, torch is needed and missing, ``out`` is no name for a
+            policy file, or the checkpoint does not fit.
         RunAborted: the loss or a weight is not finite any more; nothing of that is saved.
         KeyboardInterrupt: Ctrl-C, after a checkpoint was written.
     """
@@ -132,13 +132,9 @@ def train_on(
 ) -> TrainReport:
     """:func:`train` on recordings that are already read."""
     check_output(out)
-    try:
-        from tractor_ems.learning.experiment import begin, make_generators, prepare
-        from tractor_ems.learning.networks import one_thread
-    except ImportError as error:
-        if error.name != "torch":
-            raise
-        raise ConfigError("training needs torch: pip install 'tractor_ems[train]'") from None
+    one_thread = _one_thread(config)
+    # numba, on which the sampled learner runs, is slow to import.
+    from tractor_ems.learning.experiment import begin, make_generators, prepare
 
     generators = make_generators(config.seed)
     experiment = prepare(config, params, recordings, generators.episodes)
@@ -150,7 +146,7 @@ def train_on(
     }
     saved = checkpoint_path(out)
     began = time.perf_counter()
-    with one_thread(), _deferred_interrupt() as interrupted:
+    with one_thread, _deferred_interrupt() as interrupted:
         run = begin(experiment, generators)
         learner = run.learner
         metrics: dict[str, float] = {}
@@ -230,6 +226,25 @@ def check_output(out: Path) -> None:
         raise ConfigError(f"{out}: the policy file must end in .safetensors")
     if out.is_dir():
         raise ConfigError(f"{out}: is a folder, give the policy file to write")
+
+
+def _one_thread(config: TrainConfig) -> AbstractContextManager[None]:
+    """torch on one thread, where it is needed: bytes are repeatable then.
+
+    Raises:
+        ConfigError: torch is missing.
+    """
+    if config.targets != "counterfactual":
+        return nullcontext()
+    try:
+        from tractor_ems.learning.networks import one_thread
+    except ImportError as error:
+        if error.name != "torch":
+            raise
+        raise ConfigError(
+            "targets counterfactual: training needs torch: pip install 'tractor_ems[train]'"
+        ) from None
+    return one_thread()
 
 
 def _refuse_divergence(step: int, values: Mapping[str, Any]) -> None:
