@@ -197,7 +197,7 @@ def test_a_drive_that_burnt_nothing_has_no_efficiency():
     assert row["less fuel than conventional, here"].startswith("100.0 %")
 
 
-@pytest.mark.parametrize("seeds", [1, 2, 5])
+@pytest.mark.parametrize("seeds", [1, 5])
 def test_nothing_that_is_not_a_number_is_shown(seeds):
     for table in build_tables(build_results(seeds=seeds)):
         words = to_markdown(table).lower().replace("|", " ").split()

@@ -2,6 +2,7 @@
 every number and every verdict is computed."""
 
 import os
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -47,8 +48,8 @@ _METHOD = f"""\
   not is censored: `> N` episodes.
 - **`dp_ratio`** is the fuel of a certified DP solution that starts and ends at the run's own SOC
   over the run's fuel. The paper's way of counting, at whatever SOC a drive ends, stands beside it.
-- **SOC_min** is not printed. No single value gives both the paper's unshaped row (70 %) and its
-  shaped rows (83.6 %), so every shaped row is run with both."""
+- **SOC_min** is not printed. The paper's unshaped row ends at 70 % and its shaped rows at 83.6 %;
+  either could be the bound, so every shaped row is run with both."""
 
 _SECTIONS: Sequence[tuple[str, Sequence[str], Sequence[str]]] = (
     ("The paper's tables", ("table_1", "table_2", "summary_fuel", "summary_efficiency",
@@ -148,8 +149,7 @@ def _summary(results: StudyResults) -> str:
 
 
 def _silent_and_other(results: StudyResults) -> Iterator[tuple[str, list[str]]]:
-    silent = ("not ", "none", "silent", "-")
-    left_out = [i for i in results.differences if i["paper"].strip().lower().startswith(silent)]
+    left_out = [item for item in results.differences if "not " in item["paper"].lower()]
     yield "What the paper left out", [item["subject"] for item in left_out]
     others = [item["subject"] for item in results.differences if item not in left_out]
     yield "Done otherwise than in the paper", others
@@ -218,9 +218,7 @@ def _flat(document: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
     """Name and text of every value of nested data."""
     for name, value in document.items():
         label = prefix + str(name).replace("_", " ")
-        for unit in (" s", " h", " mb"):  # a name ends with its unit, as in code
-            if label.endswith(unit):
-                label = f"{label.removesuffix(unit)} [{unit.strip()}]"
+        label = re.sub(r" (s|h|mb)\b", r" [\1]", label)  # units in names, as in code
         if isinstance(value, Mapping):
             yield from _flat(value, f"{label}, ")
         elif isinstance(value, Sequence) and not isinstance(value, str):

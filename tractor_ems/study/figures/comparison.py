@@ -164,7 +164,9 @@ def build_convergence(results: StudyResults) -> Figure:
             axes.plot([], [], marker, color=colour, markersize=size, alpha=alpha, label=label)
         low, high = axes.get_xlim()
         axes.set_xlim(max(low, 0.7), max(high, 60_000))
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+        left, right = axes.get_xlim()
+        # Labels at every 1 and 3 run into each other over more than some two decades.
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if right < 400 * left else (1.0,)))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: thousands(value)))
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.legend(
@@ -201,7 +203,8 @@ def build_ablations(results: StudyResults) -> Figure:
                 if found is None:
                     text = NOT_RUN if not results.of(key) else "none"
                     axes.text(0.5, place, text, transform=axes.get_yaxis_transform(),
-                              ha="center", va="center", fontsize=9.5, color=GREY)  # fmt: skip
+                              ha="center", va="center", fontsize=9.5, color=GREY,
+                              bbox=_LABEL_BOX)  # fmt: skip
                     continue
                 axes.plot(found.values, [place] * len(found.values), "o", color=colour,
                           alpha=0.4, markersize=4)  # fmt: skip

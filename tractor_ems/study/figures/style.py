@@ -69,7 +69,7 @@ def write_png_and_svg(figure: Figure, png: Path, svg: Path, dpi: int = DPI) -> N
             lambda file: figure.savefig(file, format="png", dpi=dpi, metadata={"Software": None}),
         )
         # Layout is the slow part, and both files shall have the same one.
-        figure.set_layout_engine("none")
+        figure.set_layout_engine(None)
         write_bytes_with(
             svg,
             lambda file: figure.savefig(

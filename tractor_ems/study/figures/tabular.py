@@ -36,7 +36,7 @@ def build_pearson(results: StudyResults) -> Figure:
     with look():
         figure = new_figure(6.4)
         axes, scale = figure.subplots(2, 1, height_ratios=(3.2, 1))
-        axes.set(xlabel="reward of the pair [10 g of fuel, negative]", ylabel="Q [10 g of fuel]")
+        axes.set(xlabel="reward of the pair [10 g of fuel]", ylabel="Q [10 g of fuel]")
         axes.grid()
         if runs:
             run = median_run(runs)

@@ -1,6 +1,6 @@
 """What the trained DQN and DDQN do over the cycle: SOC, battery, engine and total power."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -30,54 +30,42 @@ def median_run(runs: Sequence[Run]) -> Run:
 
 
 def build_traces(results: StudyResults) -> Figure:
-    """DQN and DDQN of the median seed over one cycle, four panels as in the paper."""
-    shown = {
-        name: median_run(runs)
-        for name, key in (("DQN", "dqn@0.7"), ("DDQN", "ddqn@0.7"))
-        if (runs := results.of(key))
-    }
+    """DQN and DDQN of the median seed over one cycle, one column each, four panels as in the
+    paper. Side by side, because a policy that switches every second hides what lies below it."""
+    columns = (("DQN", "dqn@0.7", BLUE), ("DDQN", "ddqn@0.7", VERMILION))
     with look():
         figure = new_figure(8.4)
-        axes = figure.subplots(4, 1, sharex=True)
-        soc_axes, battery_axes, engine_axes, total_axes = axes
-        soc_axes.set_ylabel("SOC [%]")
-        battery_axes.set_ylabel("battery power [kW]")
-        engine_axes.set_ylabel("engine power [kW]")
-        total_axes.set_ylabel("total power [kW]")
-        total_axes.set_xlabel("time [s]")
-        for panel in axes:
-            panel.grid()
-        if shown:
-            _draw(axes, shown)
-        else:
-            for panel in axes:
-                say_not_run(panel, "DQN and DDQN")
-        figure.align_ylabels(axes)
+        panels = figure.subplots(4, 2, sharex=True, sharey="row")
+        for column, (name, key, colour) in zip(panels.T, columns, strict=True):
+            for axes in column:
+                axes.grid()
+            column[-1].set_xlabel("time [s]")
+            runs = results.of(key)
+            if not runs:
+                for axes in column:
+                    say_not_run(axes, name)
+                continue
+            run = median_run(runs)
+            column[0].set_title(f"{name}, seed {run.seed}")
+            _draw(column, run.outcome.trajectory, colour)
+        for axes, quantity in zip(panels[:, 0], _QUANTITIES, strict=True):
+            axes.set_ylabel(quantity)
+        figure.align_ylabels(panels[:, 0])
     return figure
 
 
-def _draw(axes: Sequence[Axes], shown: Mapping[str, Run]) -> None:
-    soc_axes, battery_axes, engine_axes, total_axes = axes
-    # The second is thinner, so that the first shows where both do the same.
-    looks = ((BLUE, 2.2), (VERMILION, 0.9))
-    for (name, run), (colour, width) in zip(shown.items(), looks, strict=False):
-        drive = run.outcome.trajectory
-        time_s = _time_s(drive)
-        label = f"{name}, seed {run.seed}"
-        soc_axes.plot(
-            time_s,
-            np.append(drive.soc, drive.soc_final) * 100,
-            colour,
-            label=label,
-            linewidth=width + 0.4,
-        )
-        _steps(battery_axes, time_s, drive.battery_power_w, colour, width)
-        _steps(engine_axes, time_s, drive.engine_power_w, colour, width)
-        _steps(total_axes, time_s, drive.battery_power_w + drive.engine_power_w, colour, width)
-    demand_w = next(iter(shown.values())).outcome.trajectory.power_demand_w
-    _steps(total_axes, time_s, demand_w, BLACK, 0.9, linestyle=":", label="demand")
+_QUANTITIES = ("SOC [%]", "battery power [kW]", "engine power [kW]", "total power [kW]")
+
+
+def _draw(column: Sequence[Axes], drive: Trajectory, colour: str) -> None:
+    soc_axes, battery_axes, engine_axes, total_axes = column
+    time_s = _time_s(drive)
+    soc_axes.plot(time_s, np.append(drive.soc, drive.soc_final) * 100, colour, linewidth=1.8)
+    _steps(battery_axes, time_s, drive.battery_power_w, colour)
+    _steps(engine_axes, time_s, drive.engine_power_w, colour)
+    _steps(total_axes, time_s, drive.battery_power_w + drive.engine_power_w, colour)
+    _steps(total_axes, time_s, drive.power_demand_w, BLACK, linestyle=":", label="demand")
     soc_axes.set_xlim(0.0, time_s[-1])
-    total_axes.legend(loc="lower right", bbox_to_anchor=(1, 0.98), borderaxespad=0)
     soc_axes.axhline(
         PAPER_SOC_FINAL * 100,
         color=GREY,
@@ -86,13 +74,11 @@ def _draw(axes: Sequence[Axes], shown: Mapping[str, Run]) -> None:
     )
     battery_axes.axhline(0.0, color=GREY, linewidth=0.8)
     engine_axes.axhline(
-        LOW_POWER_KW,
-        color=GREY,
-        linestyle="--",
-        label=f"paper: mostly below {LOW_POWER_KW:g} kW",
+        LOW_POWER_KW, color=GREY, linestyle="--", label=f"paper: mostly below {LOW_POWER_KW:g} kW"
     )
-    engine_axes.legend(loc="lower right", bbox_to_anchor=(1, 0.98), borderaxespad=0)
-    soc_axes.legend(ncols=3, loc="lower right", bbox_to_anchor=(1, 1.0), borderaxespad=0)
+    for axes in (soc_axes, engine_axes, total_axes):
+        axes.legend(loc="lower right", bbox_to_anchor=(1, 0.97), borderaxespad=0)
+    soc_axes.set_title(soc_axes.get_title(loc="left"), pad=20)
 
 
 def _time_s(drive: Trajectory) -> FloatArray:
@@ -106,7 +92,6 @@ def _steps(
     edges_s: FloatArray,
     power_w: FloatArray,
     colour: str,
-    width: float,
     linestyle: str = "-",
     label: str | None = None,
 ) -> None:
@@ -115,8 +100,7 @@ def _steps(
         edges_s,
         baseline=None,
         color=colour,
-        linewidth=width,
-        alpha=0.85,
+        linewidth=0.9,
         linestyle=linestyle,
         label=label,
     )

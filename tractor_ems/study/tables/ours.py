@@ -74,7 +74,7 @@ def _beside_one(results: StudyResults, reward: str, soc_min: float) -> Table:
     kind = _reward_name(reward)
     return Table(
         f"beside_{reward}_{soc_min:g}",
-        f"Learners beside what does not learn: {kind} reward, SOC_min {percent_text(soc_min)}",
+        f"Reward: {kind}; SOC_min {percent_text(soc_min)}",
         "Learners in bold. Return in the learner's units; `way` is 0 at random feasible and 100 % "
         "at the exact optimum of this reward. Fuel compares at equal final SOC only, which "
         "`dp_ratio` does.",
