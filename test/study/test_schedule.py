@@ -101,6 +101,16 @@ def test_a_killed_worker_ends_the_study_with_a_reason_and_the_others_keep_their_
     assert not any(learning(child) for child in children), "no orphan goes on learning"
 
 
+@pytest.mark.slow
+def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
+    process = started(tmp_path)
+    children = psutil.Process(process.pid).children(recursive=True)
+    process.kill()
+    process.wait(10)
+    _, alive = psutil.wait_procs([c for c in children if learning(c)], timeout=20)
+    assert not [child for child in alive if learning(child)]
+
+
 def test_there_is_a_worker_per_core_unless_told_otherwise() -> None:
     assert workers_of(3) == 3
     assert 1 <= workers_of(None) <= (os.cpu_count() or 1)

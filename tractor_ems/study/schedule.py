@@ -7,10 +7,12 @@ of work with it and nothing else; the next call goes on from what is on disk.
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
+from multiprocessing.connection import wait as wait_for
 from typing import Any, TypeAlias
 
 from tractor_ems.study.config import StudyConfig
@@ -78,7 +80,16 @@ def run_all(
 def _begin(stop: Any, shares: Any) -> None:
     """In every worker: Ctrl-C is the parent's business, which then sets the flag."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     _shared.update(stop=stop, shares=shares)
+
+
+def _end_with_parent() -> None:
+    """A worker whose parent was killed would go on for hours; its last checkpoint stays."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    wait_for([parent.sentinel])
+    os._exit(1)
 
 
 def _do(config: StudyConfig, item: Demonstration | Task, number: int) -> None:
