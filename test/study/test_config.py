@@ -72,5 +72,6 @@ def test_the_papers_own_numbers_are_used_where_it_prints_them() -> None:
 
 def test_every_difference_says_what_and_why() -> None:
     for item in load_study("paper", "smoke").differences:
-        assert set(item) == {"subject", "paper", "here", "why"}
+        assert set(item) == {"subject", "kind", "paper", "here", "why"}
+        assert "{" not in item["here"]
         assert all(item.values())

@@ -21,7 +21,7 @@ def studies() -> None:
 @app.command()
 def paper(
     preset: Annotated[
-        str, typer.Option(help="Budget: smoke (minutes), standard (about an hour), full (days).")
+        str, typer.Option(help="Budget: smoke (minutes), standard (over an hour), full (days).")
     ] = "standard",
     out: Annotated[
         Path, typer.Option(help="Folder of bags, runs, checkpoints, report; kept and reused.")

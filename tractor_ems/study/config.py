@@ -126,6 +126,15 @@ class _RowSettings:
 
 
 @dataclass(frozen=True, config=_STRICT)
+class _Difference:
+    subject: str
+    kind: Literal["silent", "different", "slip"]
+    paper: str
+    here: str
+    why: str
+
+
+@dataclass(frozen=True, config=_STRICT)
 class _File:
     powertrain: str
     cycle: str
@@ -136,7 +145,7 @@ class _File:
     experts: ExpertSettings
     presets: dict[str, Budget]
     rows: tuple[_RowSettings, ...]
-    differences: tuple[dict[Literal["subject", "paper", "here", "why"], str], ...]
+    differences: tuple[_Difference, ...]
 
 
 @dataclass(frozen=True)
@@ -149,7 +158,8 @@ class StudyConfig:
         soc_initial, soc_target: of every run.
         networks, tables, experts, budget: see there.
         rows: every row at every SOC_min, in the file's order.
-        differences: rows of the table "differences from the paper".
+        differences: rows of the table "differences from the paper": subject, kind (silent,
+            different or slip), paper, here, why.
     """
 
     preset: str
@@ -221,8 +231,14 @@ def load_study(name_or_path: str | Path, preset: str) -> StudyConfig:
         experts=file.experts,
         budget=file.presets[preset],
         rows=rows,
-        differences=tuple({str(k): v for k, v in item.items()} for item in file.differences),
+        differences=tuple(_difference(item, file.presets[preset]) for item in file.differences),
     )
+
+
+def _difference(item: _Difference, budget: Budget) -> dict[str, str]:
+    """With the preset's own number where the text leaves a place for it."""
+    number = f"{budget.steps_per_update:,}"
+    return {**asdict(item), "here": item.here.replace("{steps_per_update}", number)}
 
 
 def _row(item: _RowSettings, soc_min: float) -> Row:
