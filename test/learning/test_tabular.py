@@ -145,7 +145,7 @@ def test_the_train_return_of_a_greedy_episode_is_the_sum_of_its_rewards():
     mdp = process()
     agent = trained(mdp, 50)
     agent.tables[:] = np.random.default_rng(2).normal(size=agent.tables.shape)
-    expected = greedy_episode(agent, mdp).rewards.sum()
+    expected = greedy_episode(agent, mdp).reward.sum()
     rng = np.random.default_rng(0)
     got = train_episodes(agent, mdp, np.zeros(2), rng, gamma=0.0, alpha=1e-12)
     np.testing.assert_allclose(got, expected, rtol=1e-12)

@@ -32,6 +32,12 @@ def changed(tmp_path: Path, change) -> Path:
         (lambda d: d["rows"][6].update(margin=1.0), "allowed with replay kept"),
         (lambda d: d["rows"].append(dict(d["rows"][0], soc_min=[0.7])), r"q@0\.7 is there twice"),
         (lambda d: d["rows"][0].update(reward="speed"), "reward"),
+        (lambda d: d["rows"][0].update(soc_bins=50), "are of networks"),
+        (lambda d: d["networks"].update(warm_up=7000), r"networks\.warm_up: 7000.*preset smoke"),
+        (lambda d: d["experts"].update(dp_share=0.8), r"experts\.rule_share: 0\.25"),
+        (lambda d: d.update(soc_initial=0.95), r"soc_initial: 0\.95, allowed 0\.7\.\.0\.9"),
+        (lambda d: d.update(soc_target=0.8), r"soc_target: 0\.8, allowed 0\.836\.\.0\.9 in row"),
+        (lambda d: d["differences"][0].pop("why"), r"differences\.0\.why"),
     ],
 )
 def test_a_wrong_setting_is_refused_by_file_and_field(change, message, tmp_path: Path) -> None:

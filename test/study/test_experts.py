@@ -19,13 +19,13 @@ from tractor_ems.learning.online import make_encoder
 from tractor_ems.study.baselines import reward_config
 from tractor_ems.study.experts import (
     demonstrations,
+    drives_of,
     plant,
-    read_drives,
     record,
     seeds,
     transitions,
 )
-from tractor_msgs_py.errors import ConfigError
+from tractor_msgs_py.errors import BagError, ConfigError
 from tractor_sim.duty_cycle.library import load_cycle
 
 
@@ -58,7 +58,7 @@ def test_a_recorded_action_drives_the_recorded_power_to_half_a_grid_step(
     config = tiny("ddqn_shaped_mixed")
     mdp = process(mapping, actions)
     step_w = mdp.action_power_w[1] - mdp.action_power_w[0]
-    drive = read_drives(config, bags, expert, 0.836)[0]
+    drive = drives_of(config, bags, expert, 0.836)[0]
     told = transitions(drive, mdp, make_encoder(mdp, 200), 0.99)
     for k in range(len(told)):
         demand_w, soc = drive.power_demand_w[k], drive.soc[k]
@@ -72,7 +72,7 @@ def test_a_recorded_action_drives_the_recorded_power_to_half_a_grid_step(
 
 def test_transitions_are_counted_anew_in_the_studys_reward(bags: Path) -> None:
     config, mdp = tiny("ddqn_shaped_mixed"), process()
-    drive = read_drives(config, bags, "dp", 0.836)[0]
+    drive = drives_of(config, bags, "dp", 0.836)[0]
     told = transitions(drive, mdp, make_encoder(mdp, 200), 0.99)
     for k in (0, 5, 100, 700):
         own = reward_of(
@@ -90,7 +90,7 @@ def test_mixed_seeds_fill_half_of_the_replay_and_are_shuffled(bags: Path) -> Non
     )
     assert len(drawn) == config.replay_capacity // 2
     assert report["dp"].share == report["rule_based"].share == 0.25
-    dp = transitions(read_drives(config, bags, "dp", 0.836)[0], mdp, make_encoder(mdp, 200), 0.99)
+    dp = transitions(drives_of(config, bags, "dp", 0.836)[0], mdp, make_encoder(mdp, 200), 0.99)
     known = {row.tobytes() for row in dp.inputs}
     from_dp = np.array([row.tobytes() in known for row in drawn.inputs])
     assert from_dp[: len(drawn) // 2].any() and from_dp[len(drawn) // 2 :].any()
@@ -106,6 +106,33 @@ def test_too_few_cycles_for_the_share_are_refused(tmp_path: Path) -> None:
     config = replace(config, experts=replace(config.experts, seeds=(1, 1)))
     with pytest.raises(ConfigError, match=r"experts\.seeds: \[1, 1\] holds 1 cycles, dp needs 2"):
         demonstrations(config, tmp_path)
+
+
+def test_drives_are_read_from_the_bags_again_when_a_bag_changes(bags: Path) -> None:
+    config = tiny("ddqn_shaped_mixed")
+    first = drives_of(config, bags, "dp", 0.836)
+    again = drives_of(config, bags, "dp", 0.836)
+    assert [d.soc_target for d in again] == [0.836] * len(first)
+    for one, other in zip(first, again, strict=True):
+        np.testing.assert_array_equal(one.soc, other.soc)
+        np.testing.assert_array_equal(one.engine_on, other.engine_on)
+    bag = next(d.bag for d in demonstrations(config, bags) if d.expert == "dp")
+    mcap = next(bag.glob("*.mcap"))
+    whole = mcap.read_bytes()
+    try:
+        mcap.write_bytes(whole[: len(whole) // 2])
+        with pytest.raises(BagError, match=bag.name):
+            drives_of(config, bags, "dp", 0.836)
+    finally:
+        mcap.write_bytes(whole)
+
+
+def test_another_start_or_target_records_other_bags(tmp_path: Path) -> None:
+    config = tiny("ddqn_shaped_dp")
+    here = {item.bag for item in demonstrations(config, tmp_path)}
+    for changes in ({"soc_initial": 0.84}, {"soc_target": 0.84}):
+        other = {item.bag for item in demonstrations(replace(config, **changes), tmp_path)}
+        assert not here & other
 
 
 def test_a_bag_that_is_there_is_not_recorded_again(bags: Path) -> None:

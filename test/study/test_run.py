@@ -14,7 +14,14 @@ from study.tiny import row_of, tiny
 from tractor_ems.study import run as study_run
 from tractor_ems.study.config import StudyConfig
 from tractor_ems.study.experts import demonstrations, plant, record
-from tractor_ems.study.run import Task, config_hash, drive_again, epsilon_schedule, execute
+from tractor_ems.study.run import (
+    Task,
+    config_hash,
+    drive_again,
+    epsilon_schedule,
+    execute,
+    process_of,
+)
 from tractor_ems.study.store import is_done, load_run
 from tractor_msgs_py.errors import ConfigError, RunAborted
 from tractor_sim.duty_cycle.library import load_cycle
@@ -41,11 +48,25 @@ def stop_after(pieces: int):
 
 
 @pytest.mark.parametrize(
-    "row", ["ddqn_shaped", "dqn", "ddqn_soft_target", "q", "double_q", "double_q_interpolated"]
+    "row",
+    [
+        "ddqn_shaped",
+        "dqn",
+        "ddqn_soft_target",
+        "ddqn_shaped_dp",
+        "ddqn_shaped_dp_margin",
+        "q",
+        "double_q",
+        "double_q_interpolated",
+    ],
 )
 def test_a_stopped_and_resumed_run_gives_the_same_bytes(row: str, tmp_path: Path) -> None:
     config = tiny(row, actions=65)
-    whole, parts = task_of(config, tmp_path / "whole"), task_of(config, tmp_path / "parts")
+    for item in demonstrations(config, tmp_path / "bags"):
+        record(item, config)
+    bags = tmp_path / "bags"
+    whole = task_of(config, tmp_path / "whole", bags)
+    parts = task_of(config, tmp_path / "parts", bags)
     assert execute(whole) is not None
     assert execute(parts, stop=stop_after(1)) is None
     assert not (tmp_path / "parts" / "result.json").exists()
@@ -92,7 +113,7 @@ def test_a_saved_run_is_read_back_as_it_was(tmp_path: Path) -> None:
     task = task_of(config, tmp_path / "run")
     run = execute(task)
     assert run is not None and run.table is not None
-    back = load_run(task.folder, task.row)
+    back = load_run(task.folder, task.row, run.config_hash)
     assert back.outcome.fuel_kg == run.outcome.fuel_kg
     assert back.table is not None
     np.testing.assert_array_equal(back.table.state_visits, run.table.state_visits)
@@ -103,10 +124,13 @@ def test_a_saved_run_is_read_back_as_it_was(tmp_path: Path) -> None:
 
 def test_a_damaged_run_is_refused_by_name(tmp_path: Path) -> None:
     task = task_of(tiny("q", actions=65, episodes=1), tmp_path / "run")
-    execute(task)
+    run = execute(task)
+    assert run is not None
+    with pytest.raises(ConfigError, match="config_hash is of another run"):
+        load_run(task.folder, task.row, "another")
     (task.folder / "result.safetensors").write_bytes(b"cut short")
     with pytest.raises(ConfigError, match="run: damaged run"):
-        load_run(task.folder, task.row)
+        load_run(task.folder, task.row, run.config_hash)
 
 
 def test_a_checkpoint_of_other_settings_is_refused(tmp_path: Path) -> None:
@@ -143,36 +167,22 @@ def test_seeds_are_overwritten_in_a_fifo_and_stay_where_they_are_kept(
     run = execute(task)
     assert run is not None
     assert run.seeding["dp"]["seeded"] == 2000
-    trainer = study_run._NetworkTrainer(task, study_run_mdp(task))
+    trainer = study_run._NetworkTrainer(task, process_of(task.config, task.row))
     before = trainer.agent.replay.columns["action"][:2000].copy()
     assert trainer.agent.demonstrations.size == kept
-    for _ in range(6):  # 6 x 765 driven transitions into 4,000 places
+    assert trainer.agent.replay.size == 2000 - kept
+    for episode in range(6):  # 765 driven transitions each into 4,000 places
         trainer.train(np.ones(1))
+        still_there = np.array_equal(trainer.agent.replay.columns["action"][:2000], before)
+        if not kept:
+            assert still_there == (episode < 2), "driven ones fill the rest first, then overwrite"
     assert trainer.agent.demonstrations.size == kept
-    overwritten = not np.array_equal(trainer.agent.replay.columns["action"][:2000], before)
-    assert overwritten
-
-
-def study_run_mdp(task: Task):
-    from tractor_ems.learning.mdp import make_mdp
-    from tractor_ems.study.baselines import reward_config
-
-    config, row = task.config, task.row
-    return make_mdp(
-        plant(config, row.soc_min),
-        load_cycle(config.cycle).power_demand_w,
-        reward_config(row.reward),
-        mapping=row.mapping,
-        actions=row.actions,
-        soc_initial=config.soc_initial,
-        soc_target=config.soc_target,
-    )
 
 
 def test_a_greedy_episode_the_production_plant_drives_otherwise_is_a_bug(tmp_path: Path) -> None:
     config = tiny("ddqn_shaped", actions=65)
     task = task_of(config, tmp_path / "run")
-    trainer = study_run._NetworkTrainer(task, study_run_mdp(task))
+    trainer = study_run._NetworkTrainer(task, process_of(task.config, task.row))
     greedy, params = trainer.greedy(), plant(config, task.row.soc_min)
     demand_w = load_cycle(config.cycle).power_demand_w
     drive_again(greedy, params, demand_w, config)

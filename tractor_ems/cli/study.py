@@ -9,6 +9,7 @@ import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from tractor_ems.cli.output import NOTES, JsonFlag, print_json, print_table
+from tractor_msgs_py.errors import ConfigError
 
 app = typer.Typer(no_args_is_help=True, help="Studies that are reproduced as a whole.")
 
@@ -47,10 +48,12 @@ def paper(
     from tractor_ems.study.study import run_study
     from tractor_ems.study.tables import build_tables, to_json
 
+    target = report or out / preset / "reproduction.md"
+    if target.suffix != ".md" or target.is_dir():
+        raise ConfigError(f"{target}: the report must be a file that ends in .md")
     config = load_study(settings, preset)
     with _stages() as stage:
         results = run_study(config, out, workers=workers_of(workers), stage=stage)
-    target = report or out / preset / "reproduction.md"
     NOTES.print(f"tables and figures: {target}")
     write_report(results, target, target.with_suffix(""))
     tables = build_tables(results)

@@ -70,6 +70,24 @@ class Mdp(NamedTuple):
     kp: float
 
 
+class GreedyEpisode(NamedTuple):
+    """T steps of a greedy policy, by whatever learner.
+
+    Attributes:
+        battery_power_w: asked of the plant, shape (T,) [W].
+        engine_power_w: at the bus, shape (T,) [W].
+        fuel_kg: of every step, shape (T,).
+        reward: in the units a learner sees, shape (T,).
+        soc: before every step and after the last, shape (T + 1,).
+    """
+
+    battery_power_w: FloatArray
+    engine_power_w: FloatArray
+    fuel_kg: FloatArray
+    reward: FloatArray
+    soc: FloatArray
+
+
 def action_powers_w(params: PowertrainParams, mapping: ActionMapping, actions: int) -> FloatArray:
     """Power that each action means, shape (A,) [W].
 

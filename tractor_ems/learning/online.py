@@ -27,6 +27,7 @@ from tractor_ems.learning.dqn_kernel import (
     zero_net,
 )
 from tractor_ems.learning.mdp import (
+    GreedyEpisode,
     Mdp,
     advance,
     battery_power_w,
@@ -78,7 +79,8 @@ class Pace(NamedTuple):
         learning_rate: of Adam.
         steps_per_update: environment steps per gradient step.
         warm_up: transitions in the replay before the first update.
-        target_every, target_rate: see ``study.rows.Row``.
+        target_every, target_rate: the target net moves by ``target_rate`` every so many updates;
+            rate 1 is a hard copy.
     """
 
     gamma: float
@@ -87,16 +89,6 @@ class Pace(NamedTuple):
     warm_up: int
     target_every: int
     target_rate: float
-
-
-class GreedyEpisode(NamedTuple):
-    """T steps of the greedy policy; ``soc`` has T + 1 entries, the others T."""
-
-    battery_power_w: FloatArray
-    engine_power_w: FloatArray
-    fuel_kg: FloatArray
-    reward: FloatArray
-    soc: FloatArray
 
 
 @dataclass(frozen=True)
@@ -123,11 +115,10 @@ class OnlineAgent:
 
 
 def make_encoder(mdp: Mdp, soc_bins: int | None) -> Encoder:
-    """Scaling from the cycle's own mean and spread, and the plant's SOC window."""
+    """Scaling from the cycle's own mean and spread (at least 1 kW), and the plant's SOC window."""
     demand_w = mdp.power_demand_w
-    return Encoder(
-        float(demand_w.mean()), float(demand_w.std()), mdp.soc_min, mdp.soc_max, soc_bins or 0
-    )
+    spread_w = max(float(demand_w.std()), 1e3)
+    return Encoder(float(demand_w.mean()), spread_w, mdp.soc_min, mdp.soc_max, soc_bins or 0)
 
 
 def make_agent(

@@ -6,15 +6,14 @@ one of 50 bins at most, so snapping would freeze it. The loops are in ``tabular_
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from tractor_ems.learning import tabular_kernel as kernel
 from tractor_ems.learning import tabular_pairs as pairs
-from tractor_ems.learning.mdp import Mdp
+from tractor_ems.learning.mdp import GreedyEpisode, Mdp
 from tractor_ems.learning.tabular_pairs import Bits, Grid, Table
-from tractor_ems.study.results import TableStudy
 from tractor_msgs_py.errors import ConfigError
 from tractor_msgs_py.trajectory import FloatArray, IntArray
 
@@ -50,22 +49,27 @@ class TabularAgent:
         return len(self.tables) == 2
 
 
-class GreedyEpisode(NamedTuple):
-    """A drive without exploration.
+@dataclass(frozen=True)
+class TableStudy:
+    """What a table looks like after training.
 
     Attributes:
-        battery_power_w: asked of the plant, shape (T,) [W].
-        soc: before every step and after the last, shape (T + 1,).
-        engine_power_w: at the bus, shape (T,) [W].
-        fuel_kg: of every step, shape (T,).
-        rewards: in the units a learner sees, shape (T,).
+        state_visits: visits of every (SOC bin, demand bin), shape (50, 766).
+        pairs: entries of the table; pairs_feasible: those that the plant allows somewhere in
+            their bin; pairs_visited: those updated at least once.
+        pearson: correlation between Q and reward over visited pairs; None when undefined.
+        sample_q, sample_reward: Q and reward of at most 20,000 visited pairs, for the picture.
+        bytes: memory of the tables [B].
     """
 
-    battery_power_w: FloatArray
-    soc: FloatArray
-    engine_power_w: FloatArray
-    fuel_kg: FloatArray
-    rewards: FloatArray
+    state_visits: IntArray
+    pairs: int
+    pairs_feasible: int
+    pairs_visited: int
+    pearson: float | None
+    sample_q: FloatArray
+    sample_reward: FloatArray
+    bytes: int
 
 
 def make_agent(
@@ -162,7 +166,7 @@ def greedy_episode(agent: TabularAgent, mdp: Mdp) -> GreedyEpisode:
     soc = np.zeros(steps + 1)
     ties = np.random.default_rng(_GREEDY_TIES_SEED)
     kernel.greedy(agent.tables, agent.grid, mdp, ties, asked_w, soc, engine_w, fuel_kg, rewards)
-    return GreedyEpisode(asked_w, soc, engine_w, fuel_kg, rewards)
+    return GreedyEpisode(asked_w, engine_w, fuel_kg, rewards, soc)
 
 
 def table_study(agent: TabularAgent, mdp: Mdp, rng: np.random.Generator) -> TableStudy:
@@ -198,7 +202,13 @@ def table_study(agent: TabularAgent, mdp: Mdp, rng: np.random.Generator) -> Tabl
 
 def pairs_visited(agent: TabularAgent) -> int:
     """Pairs that were ever updated."""
-    return int(np.bitwise_count(agent.visited).sum(dtype=np.int64))
+    return _bits(agent.visited)
+
+
+def _bits(octets: Bits) -> int:
+    """Bits that are set; numpy counts them itself from 2.0 on."""
+    each = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1)
+    return int(np.bincount(octets, minlength=256) @ each)
 
 
 def sparse_state(agent: TabularAgent) -> dict[str, np.ndarray[Any, Any]]:
@@ -226,7 +236,7 @@ def restore_state(agent: TabularAgent, tensors: Mapping[str, np.ndarray[Any, Any
             found = "missing" if value is None else f"{value.dtype} {value.shape}"
             raise ConfigError(f"checkpoint tensor {name}: {found}, allowed {dtype} {shape}")
     visited, values = tensors["visited"], tensors["values"]
-    count = int(np.bitwise_count(visited).sum(dtype=np.int64))
+    count = _bits(visited)
     if values.shape != (len(agent.tables), count):
         raise ConfigError(
             f"checkpoint tensor values: {values.shape}, allowed {(len(agent.tables), count)}"

@@ -12,7 +12,7 @@ from tractor_ems.learning.mdp import ActionMapping
 from tractor_ems.learning.rewards import RewardKind
 from tractor_ems.study.rows import Algorithm, Row, SeedingKind
 from tractor_msgs_py.errors import ConfigError
-from tractor_sim.config import describe
+from tractor_sim.config import describe, load_powertrain
 from tractor_sim.resources import resource_path
 from tractor_sim.yaml_file import read_yaml
 
@@ -117,6 +117,10 @@ class _RowSettings:
         tabular = self.algorithm in ("q", "double_q")
         if tabular and self.seeding != "none":
             raise ConfigError(f"row {self.id}: seeding {self.seeding}, tables have no replay")
+        if tabular and (self.soc_bins, self.target_every, self.target_rate) != (None, 1000, 1.0):
+            raise ConfigError(
+                f"row {self.id}: soc_bins, target_every, target_rate are of networks"
+            )
         if self.interpolate and not tabular:
             raise ConfigError(f"row {self.id}: interpolate is of tables, not of {self.algorithm}")
         if self.replay == "kept" and self.seeding == "none":
@@ -216,10 +220,7 @@ def load_study(name_or_path: str | Path, preset: str) -> StudyConfig:
     if preset not in file.presets:
         raise ConfigError(f"{path}: preset {preset!r}, allowed {', '.join(file.presets)}")
     rows = tuple(_row(item, soc_min) for item in file.rows for soc_min in item.soc_min)
-    keys = [row.key for row in rows]
-    for key in keys:
-        if keys.count(key) > 1:
-            raise ConfigError(f"{path}: rows: {key} is there twice")
+    _check(path, file, rows)
     return StudyConfig(
         preset=preset,
         powertrain=file.powertrain,
@@ -233,6 +234,35 @@ def load_study(name_or_path: str | Path, preset: str) -> StudyConfig:
         rows=rows,
         differences=tuple(_difference(item, file.presets[preset]) for item in file.differences),
     )
+
+
+def _check(path: Path, file: _File, rows: tuple[Row, ...]) -> None:
+    """What no field can check alone."""
+    keys = [row.key for row in rows]
+    for key in keys:
+        if keys.count(key) > 1:
+            raise ConfigError(f"{path}: rows: {key} is there twice")
+    experts, networks = file.experts, file.networks
+    if experts.dp_share + experts.rule_share > 1.0:
+        raise ConfigError(
+            f"{path}: experts.rule_share: {experts.rule_share} beside dp_share "
+            f"{experts.dp_share}, together allowed 0..1"
+        )
+    for name, budget in file.presets.items():
+        capacity = budget.replay_capacity or networks.replay_capacity
+        if networks.warm_up > capacity:
+            raise ConfigError(
+                f"{path}: networks.warm_up: {networks.warm_up}, allowed at most the replay's "
+                f"capacity, {capacity} in preset {name}"
+            )
+    soc_max = load_powertrain(file.powertrain).battery.soc_max
+    for row in rows:
+        for name in ("soc_initial", "soc_target"):
+            soc = getattr(file, name)
+            if not row.soc_min <= soc <= soc_max:
+                raise ConfigError(
+                    f"{path}: {name}: {soc}, allowed {row.soc_min:g}..{soc_max:g} in row {row.key}"
+                )
 
 
 def _difference(item: _Difference, budget: Budget) -> dict[str, str]:

@@ -2,10 +2,11 @@
 counted anew in the study's reward.
 """
 
+import hashlib
+import json
 import os
-import shutil
+import tempfile
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -15,24 +16,29 @@ from numba import njit
 from tractor_ems.bags.in_process import record_in_process
 from tractor_ems.learning.mdp import Mdp, bounds_w, feasible_actions, reward_of
 from tractor_ems.learning.online import INPUTS, Encoder, encode_trace
-from tractor_ems.learning.recorded import Drive, drive_of_trace
-from tractor_ems.learning.recordings import read_recordings
+from tractor_ems.learning.recorded import Drive
 from tractor_ems.learning.replay import Seeding, Transitions, concatenate, draw_seeds
 from tractor_ems.policies.registry import make_policy
 from tractor_ems.scenario import make_scenario
 from tractor_ems.study.config import StudyConfig
+from tractor_ems.study.drives import read_drives
 from tractor_ems.study.rows import Row
-from tractor_msgs_py.errors import ConfigError
+from tractor_msgs_py.errors import BagError, ConfigError
 from tractor_msgs_py.trajectory import FloatArray, IntArray
 from tractor_sim.config import load_powertrain
 from tractor_sim.duty_cycle.cycle import cycle_hash
 from tractor_sim.duty_cycle.library import load_cycle
 from tractor_sim.powertrain import ROUNDING_W, PowertrainParams
+from tractor_sim.powertrain_json import powertrain_hash
 
 Expert = Literal["dp", "rule_based"]
 
-EDGE_W = 1.0
-"""A recorded power this close to lb or ub is lb or ub: SOC is recorded with float32 resolution."""
+EDGE_W = 25.0
+"""A recorded power this close to lb or ub is lb or ub: half a float32 step of SOC is 20 W of a
+185 kWh battery over one second."""
+
+RECORDING = 1
+"""Raise when the same expert drives otherwise: bags are then recorded anew."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +86,24 @@ def demonstrations(config: StudyConfig, folder: Path) -> tuple[Demonstration, ..
                     f"experts.seeds: {list(config.experts.seeds)} holds {len(names)} cycles, "
                     f"{expert} needs {count} to fill {share:.0%} of {config.replay_capacity}"
                 )
+            runs = folder / f"soc_min_{row.soc_min:g}-{_recipe(config, row.soc_min)}" / expert
             for name in names[:count]:
-                bag = folder / f"soc_min_{row.soc_min:g}" / expert / name
-                found[Demonstration(expert, name, row.soc_min, bag)] = None
+                found[Demonstration(expert, name, row.soc_min, runs / name)] = None
     return tuple(found)
+
+
+def _recipe(config: StudyConfig, soc_min: float) -> str:
+    """First digits of the hash of what decides a recorded run besides driver and cycle."""
+    text = json.dumps(
+        {
+            "recording": RECORDING,
+            "powertrain_hash": powertrain_hash(plant(config, soc_min)),
+            "soc_initial": config.soc_initial,
+            "soc_target": config.soc_target,
+        },
+        sort_keys=True,
+    )
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def record(demonstration: Demonstration, config: StudyConfig) -> None:
@@ -95,28 +115,28 @@ def record(demonstration: Demonstration, config: StudyConfig) -> None:
         config.powertrain, demonstration.cycle, config.soc_initial, config.soc_target
     )
     scenario = replace(scenario, params=plant(config, demonstration.soc_min))
-    part = bag.parent / f".part.{os.getpid()}" / bag.name
-    part.parent.mkdir(parents=True, exist_ok=True)
     # The paper's rule has no guard: the plant itself holds SOC_min.
     policy = make_policy(demonstration.expert, scenario, soc_guard=False)
-    record_in_process(policy, scenario, part)
-    part.rename(bag)
-    shutil.rmtree(part.parent)
+    try:
+        bag.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".part.", dir=bag.parent) as part:
+            record_in_process(policy, scenario, Path(part) / bag.name)
+            os.rename(Path(part) / bag.name, bag)
+    except OSError as error:
+        raise BagError(f"{bag}: cannot be written ({error.strerror or error})") from None
 
 
-def read_drives(
+def drives_of(
     config: StudyConfig, folder: Path, expert: Expert, soc_min: float
 ) -> tuple[Drive, ...]:
-    """What the bags of one expert hold, by the reader that training uses."""
+    """What the bags of one expert hold, by the reader that training uses.
+
+    Raises:
+        BagError: a bag is missing, damaged or of another powertrain.
+    """
     wanted = [d for d in demonstrations(config, folder) if d.soc_min == soc_min]
-    bags = tuple(d.bag for d in wanted if d.expert == expert)
-    return _read(bags, plant(config, soc_min))
-
-
-@lru_cache(maxsize=8)  # a worker trains many agents from the same bags
-def _read(bags: tuple[Path, ...], params: PowertrainParams) -> tuple[Drive, ...]:
-    found = (drive_of_trace(trace) for trace in read_recordings(bags, [], params).traces)
-    return tuple(drive for drive in found if drive is not None)
+    bags = [d.bag for d in wanted if d.expert == expert]
+    return read_drives(bags, plant(config, soc_min))
 
 
 def seeds(
@@ -131,7 +151,7 @@ def seeds(
     parts, reports = [], dict[str, Seeding]()
     for expert, share in shares(row, config).items():
         if share > 0.0:
-            drives = read_drives(config, folder, expert, row.soc_min)
+            drives = drives_of(config, folder, expert, row.soc_min)
             driven = [transitions(d, mdp, encoder, config.networks.gamma) for d in drives]
             drawn, reports[expert] = draw_seeds(
                 concatenate(driven, INPUTS), share, config.replay_capacity, rng

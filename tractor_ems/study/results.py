@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from tractor_ems.learning.tabular import TableStudy
 from tractor_ems.study.rows import Row
 from tractor_msgs_py.trajectory import FloatArray, IntArray, Trajectory
 
@@ -54,29 +55,6 @@ class Curve:
     eval_return: FloatArray
     eval_fuel_kg: FloatArray
     eval_soc_final: FloatArray
-
-
-@dataclass(frozen=True)
-class TableStudy:
-    """What a table looks like after training.
-
-    Attributes:
-        state_visits: visits of every (SOC bin, demand bin), shape (50, 766).
-        pairs: entries of the table; pairs_feasible: those that the plant allows somewhere in
-            their bin; pairs_visited: those updated at least once.
-        pearson: correlation between Q and reward over visited pairs; None when undefined.
-        sample_q, sample_reward: Q and reward of at most 20,000 visited pairs, for the picture.
-        bytes: memory of the tables [B].
-    """
-
-    state_visits: IntArray
-    pairs: int
-    pairs_feasible: int
-    pairs_visited: int
-    pearson: float | None
-    sample_q: FloatArray
-    sample_reward: FloatArray
-    bytes: int
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,8 @@ import numpy as np
 from tractor_ems.learning import tabular
 from tractor_ems.learning.checkpoint import load_checkpoint, save_checkpoint
 from tractor_ems.learning.dqn_kernel import Rule
-from tractor_ems.learning.mdp import Mdp, make_mdp
+from tractor_ems.learning.mdp import GreedyEpisode, Mdp, make_mdp
 from tractor_ems.learning.online import (
-    GreedyEpisode,
     Pace,
     agent_tensors,
     greedy_episode,
@@ -31,11 +30,12 @@ from tractor_ems.learning.online import (
     train_episodes,
 )
 from tractor_ems.learning.replay import Seeding
+from tractor_ems.learning.tabular import TableStudy
 from tractor_ems.policies.protocol import ANY_RUN
 from tractor_ems.study.baselines import outcome_of, reward_config
 from tractor_ems.study.config import StudyConfig
 from tractor_ems.study.experts import plant, seeds
-from tractor_ems.study.results import Curve, Run, TableStudy
+from tractor_ems.study.results import Curve, Run
 from tractor_ems.study.rows import Row
 from tractor_ems.study.store import save_run
 from tractor_msgs_py.errors import RunAborted
@@ -77,6 +77,25 @@ def config_hash(config: StudyConfig, row: Row, seed: int) -> str:
     return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
 
 
+def process_of(config: StudyConfig, row: Row) -> Mdp:
+    """The decision process of a row: the study's cycle on its plant, in its reward."""
+    params = plant(config, row.soc_min)
+    return make_mdp(
+        params,
+        bus_demand_w(config, params),
+        reward_config(row.reward),
+        mapping=row.mapping,
+        actions=row.actions,
+        soc_initial=config.soc_initial,
+        soc_target=config.soc_target,
+    )
+
+
+def bus_demand_w(config: StudyConfig, params: PowertrainParams) -> FloatArray:
+    """Demand of the study's cycle at the bus, auxiliaries included, shape (T,) [W]."""
+    return load_cycle(config.cycle).power_demand_w + params.p_aux_w
+
+
 def execute(
     task: Task,
     *,
@@ -95,20 +114,12 @@ def execute(
     """
     config, row = task.config, task.row
     params = plant(config, row.soc_min)
-    cycle = load_cycle(config.cycle)
-    demand_w = cycle.power_demand_w + params.p_aux_w
-    mdp = make_mdp(
-        params,
-        demand_w,
-        reward_config(row.reward),
-        mapping=row.mapping,
-        actions=row.actions,
-        soc_initial=config.soc_initial,
-        soc_target=config.soc_target,
-    )
+    mdp = process_of(config, row)
     digest = config_hash(config, row, task.seed)
     trainer = _TableTrainer(task, mdp) if row.tabular else _NetworkTrainer(task, mdp)
     progress = _Progress()
+    for left in task.folder.glob(".*.part"):  # of a process that was killed while it wrote
+        left.unlink()
     checkpoint, identity = task.folder / "checkpoint.safetensors", {"config_hash": digest}
     if checkpoint.exists():
         tensors, state = load_checkpoint(checkpoint, identity)
@@ -134,13 +145,13 @@ def execute(
             if stopped:
                 return None
     seconds = progress.seconds + time.monotonic() - began
-    trajectory = drive_again(trainer.greedy(), params, demand_w, config)
+    trajectory = drive_again(trainer.greedy(), params, mdp.power_demand_w, config)
     run = Run(
         row=row,
         seed=task.seed,
         config_hash=digest,
         episodes=progress.done,
-        steps=progress.done * len(demand_w),
+        steps=progress.done * len(mdp.power_demand_w),
         updates=trainer.updates(progress.done),
         curve=progress.curve(),
         outcome=outcome_of(
@@ -151,6 +162,8 @@ def execute(
         seconds=seconds,
         peak_rss_bytes=_peak_rss_bytes(),
     )
+    if not np.isfinite([run.outcome.fuel_kg, run.outcome.reward_sum]).all():
+        raise RunAborted(f"{row.key} seed {task.seed}: fuel or sum of rewards is not finite")
     save_run(task.folder, run)
     checkpoint.unlink(missing_ok=True)
     return run
@@ -304,10 +317,7 @@ class _TableTrainer:
         )
 
     def greedy(self) -> GreedyEpisode:
-        found = tabular.greedy_episode(self.agent, self.mdp)
-        return GreedyEpisode(
-            found.battery_power_w, found.engine_power_w, found.fuel_kg, found.rewards, found.soc
-        )
+        return tabular.greedy_episode(self.agent, self.mdp)
 
     def updates(self, episodes: int) -> int:
         return episodes * (len(self.mdp.power_demand_w) - 1)

@@ -13,7 +13,8 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from tractor_ems.study.results import Curve, Outcome, Run, TableStudy
+from tractor_ems.learning.tabular import TableStudy
+from tractor_ems.study.results import Curve, Outcome, Run
 from tractor_ems.study.rows import Row
 from tractor_msgs_py.atomic import write_bytes, write_json
 from tractor_msgs_py.errors import ConfigError
@@ -29,7 +30,6 @@ def run_folder(out: Path, row: Row, seed: int, config_hash: str) -> Path:
 
 def save_run(folder: Path, run: Run) -> None:
     """Write a finished run."""
-    folder.mkdir(parents=True, exist_ok=True)
     arrays = {f"curve.{name}": value for name, value in vars(run.curve).items()}
     trajectory = vars(run.outcome.trajectory)
     arrays |= {f"drive.{n}": v for n, v in trajectory.items() if n != "soc_final"}
@@ -68,13 +68,15 @@ def is_done(folder: Path, config_hash: str) -> bool:
     return bool(_read_json(path).get("config_hash") == config_hash)
 
 
-def load_run(folder: Path, row: Row) -> Run:
+def load_run(folder: Path, row: Row, config_hash: str) -> Run:
     """Inverse of :func:`save_run`; label and role are ``row``'s, which decide no result.
 
     Raises:
-        ConfigError: a file is missing or damaged.
+        ConfigError: a file is missing, damaged or of another run.
     """
     document, cost = _read_json(folder / "result.json"), _read_json(folder / "cost.json")
+    if document.get("config_hash") != config_hash:
+        raise ConfigError(f"{folder}: config_hash is of another run; remove it and run again")
     path = folder / "result.safetensors"
     try:
         arrays = load(path.read_bytes())

@@ -1,0 +1,35 @@
+"""Where numba keeps compiled code: a folder named by the sources that went into it.
+
+numba looks only at the age of the file that a function stands in. A loop that calls another
+file's function, or uses its constants, would stay old when that file changes.
+"""
+
+import hashlib
+import os
+import sys
+from pathlib import Path
+
+_ROOT = Path(__file__).resolve().parents[1]
+_SOURCES = ("tractor_ems/learning", "tractor_ems/optimal", "tractor_ems/study", "tractor_sim")
+
+
+def sources_digest() -> str:
+    """Hash of the files that compiled code may be made of."""
+    digest = hashlib.sha256()
+    for folder in _SOURCES:
+        for path in sorted((_ROOT / folder).glob("*.py")):
+            digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def keep_apart() -> None:
+    """Point numba at the folder of these sources, unless NUMBA_CACHE_DIR is set.
+
+    Where that folder cannot be written to, numba finds a place of its own.
+    """
+    if "NUMBA_CACHE_DIR" in os.environ:
+        return
+    folder = Path(__file__).resolve().parent / "__pycache__" / f"numba-{sources_digest()}"
+    if "numba" in sys.modules:  # it has read its environment already
+        sys.modules["numba"].config.CACHE_DIR = str(folder)
+    os.environ["NUMBA_CACHE_DIR"] = str(folder)
