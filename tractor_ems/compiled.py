@@ -10,14 +10,20 @@ import sys
 from pathlib import Path
 
 _ROOT = Path(__file__).resolve().parents[1]
-_SOURCES = ("tractor_ems/learning", "tractor_ems/optimal", "tractor_ems/study", "tractor_sim")
+_SOURCES = (
+    "tractor_ems/learning/*.py",
+    "tractor_ems/optimal/*.py",
+    "tractor_ems/study/experts.py",
+    "tractor_sim/*.py",
+)
+"""Every file with compiled functions, and every file whose constants they use."""
 
 
 def sources_digest() -> str:
     """Hash of the files that compiled code may be made of."""
     digest = hashlib.sha256()
-    for folder in _SOURCES:
-        for path in sorted((_ROOT / folder).glob("*.py")):
+    for pattern in _SOURCES:
+        for path in sorted(_ROOT.glob(pattern)):
             digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]
 

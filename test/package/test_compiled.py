@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import tractor_ems
-from tractor_ems.compiled import sources_digest
+from tractor_ems.compiled import _SOURCES, sources_digest
 
 PACKAGES = ("tractor_ems", "tractor_msgs_py", "tractor_sim")
 
@@ -24,6 +24,18 @@ mdp = make_mdp(load_powertrain("paper"), two, RewardConfig("piecewise"), mapping
                actions=100, soc_initial=0.85, soc_target=0.85)
 print(_retell(mdp, two, np.full(3, 0.85), two, np.zeros(2), np.zeros(2))[1][0])
 """
+
+
+def test_every_file_with_compiled_functions_is_among_the_sources() -> None:
+    root = Path(tractor_ems.__file__).parents[1]
+    named = {path for pattern in _SOURCES for path in root.glob(pattern)}
+    compiled = {
+        path
+        for package in PACKAGES
+        for path in (root / package).rglob("*.py")
+        if "import njit" in path.read_text() or "import register_jitable" in path.read_text()
+    }
+    assert compiled and compiled <= named
 
 
 def test_the_cache_is_named_by_the_sources() -> None:
