@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tractor_ems.study.convergence import MIN_SEEDS
+from tractor_ems.study.names import BASELINE_NAMES, names_within
 from tractor_ems.study.paper_values import (
     PEARSON,
     PERCENTAGES,
@@ -28,6 +29,7 @@ from tractor_ems.study.verdicts import (
     above,
     all_hold,
     baseline_of,
+    baseline_score,
     below,
     defined_of,
     dp_ratio_text,
@@ -71,8 +73,9 @@ def same_fuel(results: StudyResults, keys: Sequence[str]) -> Found:
         return unresolved("a seed burnt nothing, which has no ratio")
     ratio = ratio_interval(first, second, rng())
     more = probability_of_improvement(first, second, rng())
+    names = names_within(keys)
     fuels = [
-        f"{key} {iqm_text(np.array([gallons(v) for v in values]))} gal"
+        f"{names[key]} {iqm_text(np.array([gallons(v) for v in values]))} gal"
         for key, values in zip(keys, (first, second), strict=True)
     ]
     socs = [iqm_text(values_of(results, key, lambda o: o.soc_final)) for key in keys]
@@ -88,17 +91,20 @@ def low_power(results: StudyResults, keys: Sequence[str]) -> Found:
     """The engine runs below 60 kW most of its time, at 25 % or less."""
     verdicts: list[Verdict] = []
     numbers = []
+    names = names_within(keys)
     for key in keys:
         shares = defined_of(results, key, lambda o: o.below_60kw_share)
         efficiencies = defined_of(results, key, lambda o: o.efficiency)
         if min(len(shares), len(efficiencies)) < MIN_SEEDS:
             verdicts.append(OPEN)
-            numbers.append(f"{key}: the engine ran in {len(shares)} seeds, {MIN_SEEDS} are needed")
+            numbers.append(
+                f"{names[key]}: the engine ran in {len(shares)} seeds, {MIN_SEEDS} are needed"
+            )
             continue
         share, efficiency = iqm_interval(shares, rng()), iqm_interval(efficiencies, rng())
         verdicts += [above(share, PREDOMINANT), below(efficiency, LOW_EFFICIENCY)]
         numbers.append(
-            f"{key}: {share.text(2)} of the running time below 60 kW, "
+            f"{names[key]}: {share.text(2)} of the running time below 60 kW, "
             f"efficiency {efficiency.text()}"
         )
     return all_hold(verdicts), join(*numbers)
@@ -147,9 +153,9 @@ def near_dp(results: StudyResults, keys: Sequence[str]) -> Found:
     for name in ("best_point", "myopic", "rule_based"):
         other = baseline_of(results, name, row.reward, row.soc_min)
         if other is None:
-            others.append(f"{name} not driven")
+            others.append(f"{BASELINE_NAMES[name]} not driven")
         else:
-            others.append(f"{name} {_without_learning(other.outcome, best)}")
+            others.append(f"{BASELINE_NAMES[name]} {_without_learning(other.outcome, best)}")
     return verdict, join(
         f"DP fuel / fuel {fuel.text()}, efficiency / DP's {efficiency.text()}",
         f"final SOC minus DP's {gap.text(4)}, the same within {SAME_SOC}",
@@ -159,28 +165,43 @@ def near_dp(results: StudyResults, keys: Sequence[str]) -> Found:
 
 
 def tabular_unsuitable(results: StudyResults, keys: Sequence[str]) -> Found:
-    """After the paper's episodes most pairs are unvisited and the drive is short of the
-    optimum."""
-    verdicts: list[Verdict] = []
-    numbers = [f"{episodes_text(results.episodes_tabular)} episodes"]
-    for key in keys:
-        tables = [run.table for run in results.of(key) if run.table is not None]
-        scores = scores_of(results, key)
-        if len(tables) < MIN_SEEDS or scores is None:
-            return unresolved(f"{key}: no tables, or no reference drives to score with")
-        unvisited = iqm_interval([1.0 - t.pairs_visited / t.pairs for t in tables], rng())
-        feasible = iqm_interval([t.pairs_visited / t.pairs_feasible for t in tables], rng())
-        score = iqm_interval(scores, rng())
-        verdicts += [above(unvisited, PREDOMINANT), below(score, SOLVED)]
-        numbers.append(
-            f"{key}: {unvisited.text()} of the pairs never visited "
-            f"({1.0 - feasible.value:.3f} of the feasible ones), "
-            f"{score.text()} of the way from random to the optimum"
+    """After the paper's episodes most pairs are unvisited and the drive is short of the optimum
+    of its reward. Beside it what looking at the next reward alone reaches: a score near that
+    shows no learning."""
+    key = keys[0]
+    row = results.of(key)[0].row
+    tables = [run.table for run in results.of(key) if run.table is not None]
+    scores = scores_of(results, key)
+    if len(tables) < MIN_SEEDS or scores is None:
+        return unresolved("no tables, or no reference drives to score with")
+    unvisited = iqm_interval([1.0 - t.pairs_visited / t.pairs for t in tables], rng())
+    feasible = iqm_interval(
+        [1.0 - min(t.pairs_visited / t.pairs_feasible, 1.0) for t in tables], rng()
+    )
+    score = iqm_interval(scores, rng())
+    myopic = baseline_of(results, "myopic", row.reward, row.soc_min)
+    alone = baseline_score(results, "myopic", row.reward, row.soc_min)
+    without = "myopic greedy not driven"
+    if myopic is not None and alone is not None:
+        place = "better than" if alone > score.high else "worse than"
+        if score.low <= alone <= score.high:
+            place = "no different from"
+        ratio = myopic.outcome.dp_ratio
+        without = (
+            f"myopic greedy, which learns nothing, reaches {alone:.3f} of that way, "
+            f"{place} this agent" + ("" if ratio is None else f", dp_ratio {ratio:.4f}")
         )
-    again = scores_of(results, "double_q_interpolated@0.7")
-    if again is not None:
-        numbers.append(f"{iqm_text(again)} with the same table interpolated between SOC bins")
-    verdict = all_hold(verdicts)
+    numbers = (
+        f"{episodes_text(results.episodes_tabular)} episodes",
+        f"{unvisited.text()} of the pairs never visited, {feasible.text()} of the feasible ones "
+        f"({percent_text(PREDOMINANT, 0)} of all is asked)",
+        f"{score.text()} of the way from random to the optimum of its reward "
+        f"(suitable from {SOLVED})",
+        without,
+        f"final SOC {iqm_text(values_of(results, key, lambda o: o.soc_final))}",
+        f"dp_ratio {dp_ratio_text(results, key)}",
+    )
+    verdict = all_hold([above(unvisited, PREDOMINANT), below(score, SOLVED)])
     if verdict == "holds" and results.episodes_tabular < SETTINGS.tabular_episodes:
         return unresolved(join("fewer episodes than the paper's 100,000", *numbers))
     return verdict, join(*numbers)

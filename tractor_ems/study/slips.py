@@ -20,9 +20,15 @@ from tractor_ems.study.paper_values import (
     episodes_text,
     percent_text,
 )
+from tractor_ems.study.table1 import implied_battery_j
 from tractor_sim.config import load_powertrain
 from tractor_sim.engine import best_power_w
 from tractor_sim.fuel import DENSITY_KG_PER_L, L_PER_US_GALLON
+
+_J_PER_KWH = 3.6e6
+
+_TABLE_1_EFFICIENCIES = (0.42, 0.435)
+"""Engine efficiency that a control of Table 1 can have on average; the paper's best is 42-44 %."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +50,13 @@ class Slip:
 
 def slips() -> tuple[Slip, ...]:
     """The paper's inconsistencies, in the order of their subjects."""
-    return (*_speed_slips(), *_fuel_slips(), *_reward_slips(), *_method_slips())
+    return (
+        *_speed_slips(),
+        *_fuel_slips(),
+        *_battery_slips(),
+        *_reward_slips(),
+        *_method_slips(),
+    )
 
 
 def fewer(before: float, after: float) -> float:
@@ -212,12 +224,55 @@ def _fuel_slips() -> tuple[Slip, ...]:
     )
 
 
+def _battery_slips() -> tuple[Slip, ...]:
+    plain, shaped, dp = _printed("ddqn"), _printed("ddqn_shaped"), _printed("dp")
+    second = TABLE_1[2]
+    assert plain.soc_final is not None
+    assert shaped.soc_final is not None
+    assert second.soc_final is not None
+    low, high = (
+        implied_battery_j(efficiency) / _J_PER_KWH for efficiency in _TABLE_1_EFFICIENCIES
+    )
+    other = load_powertrain("paper").battery.energy_j / _J_PER_KWH
+    return (
+        Slip(
+            "no single SOC_min",
+            f"final SOC {percent_text(plain.soc_final)} without shaping, "
+            f"{percent_text(shaped.soc_final)} with shaping and for DP",
+            "both rewards pay most for a stopped engine, so each optimum ends at SOC_min: one "
+            f"bound of {percent_text(plain.soc_final)} would end the shaped rows there too, one "
+            f"of {percent_text(shaped.soc_final)} would keep the unshaped row from "
+            f"{percent_text(plain.soc_final)}",
+            "Table 2; summary table",
+        ),
+        Slip(
+            "Table 1, final SOC",
+            f"Control 2 ends at {percent_text(second.soc_final, 0)}",
+            f"below the {percent_text(plain.soc_final, 0)} at which the unshaped agent of the "
+            "other tables stops; a bound there would not allow it",
+            "Table 1; Table 2",
+        ),
+        Slip(
+            "Table 1, battery",
+            f"Control 1 to Control 2: {TABLE_1[1].fuel_gal:.2f} to {second.fuel_gal:.2f} gal for "
+            f"{100 * ((TABLE_1[1].soc_final or 0.0) - second.soc_final):.0f} points of SOC",
+            f"that is {low:.0f}-{high:.0f} kWh at an engine efficiency of "
+            f"{100 * _TABLE_1_EFFICIENCIES[0]:g}-{100 * _TABLE_1_EFFICIENCIES[1]:g} %, against "
+            f"{other:.0f} kWh that fit the other tables (final SOC of DP "
+            f"{percent_text(dp.soc_final or 0.0)})",
+            "Table 1; summary table",
+        ),
+    )
+
+
 def _reward_slips() -> tuple[Slip, ...]:
     engine = load_powertrain("paper").engine
-    edge, above, top, best = piecewise_reward(
+    before, start, edge, above, top, best = piecewise_reward(
         engine,
         np.array(
             [
+                np.nextafter(SETTINGS.efficient_from_w, 0.0),
+                SETTINGS.efficient_from_w,
                 SETTINGS.efficient_to_w,
                 np.nextafter(SETTINGS.efficient_to_w, np.inf),
                 SETTINGS.engine_max_w,
@@ -237,6 +292,13 @@ def _reward_slips() -> tuple[Slip, ...]:
             "shaped reward at the engine's maximum",
             "the branch above 190 kW ends below 275 kW",
             f"exactly 275 kW, a legal power, earns {top:.0f} like an impossible one",
+            "Reward Shaping",
+        ),
+        Slip(
+            "shaped reward at 110 kW",
+            "110 kW is the start of the efficient region",
+            f"the reward jumps by {start - before:.1f} there, from {before:.2f} to {start:.2f} "
+            "(engine curve of this study): 1 W decides more than all efficiencies within it",
             "Reward Shaping",
         ),
         Slip(

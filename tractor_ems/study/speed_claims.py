@@ -9,6 +9,7 @@ from tractor_ems.study.convergence import (
     converged,
     convergence_over_seeds,
 )
+from tractor_ems.study.names import names_within, row_name
 from tractor_ems.study.paper_values import percent_text
 from tractor_ems.study.results import StudyResults
 from tractor_ems.study.statistics import difference_interval, ratio_interval
@@ -55,8 +56,9 @@ def lies_between(results: StudyResults, keys: Sequence[str]) -> Found:
 def all_converge(results: StudyResults, keys: Sequence[str]) -> Found:
     """Every seed of every row converges; a budget that ends first proves nothing."""
     rows = {key: convergences(results, key) for key in keys}
+    names = names_within(keys)
     numbers = ", ".join(
-        f"{key} {convergence_over_seeds(runs, rng()).text}" for key, runs in rows.items()
+        f"{names[key]} {convergence_over_seeds(runs, rng()).text}" for key, runs in rows.items()
     )
     reasons = {run.reason for runs in rows.values() for run in runs if run.episodes is None}
     if reasons:
@@ -70,6 +72,7 @@ def speed_not_optimality(results: StudyResults, keys: Sequence[str]) -> Found:
     would differ by chance more often than 5 %."""
     comparison, numbers = _compare(results, keys[1], keys[-1])
     resolved, why = _decided(comparison)
+    names = names_within(keys)
     fuels = {key: values_of(results, key, lambda o: o.fuel_kg) for key in keys}
     if min(values.min() for values in fuels.values()) <= 0.0:
         return unresolved("a seed burnt nothing, which has no ratio")
@@ -84,13 +87,13 @@ def speed_not_optimality(results: StudyResults, keys: Sequence[str]) -> Found:
     return all_hold([speed, optimality]), join(
         why,
         numbers,
-        f"fuel over {keys[0]}'s: "
-        + ", ".join(f"{key} {ratio.text()}" for key, ratio in ratios.items())
+        f"fuel over that of {names[keys[0]]}: "
+        + ", ".join(f"{names[key]} {ratio.text()}" for key, ratio in ratios.items())
         + f" (the same within {percent_text(SAME_FUEL, 0)}: {same_fuel})",
         "final SOC minus its: "
-        + ", ".join(f"{key} {gap.text(4)}" for key, gap in gaps.items())
+        + ", ".join(f"{names[key]} {gap.text(4)}" for key, gap in gaps.items())
         + f" (the same within {SAME_SOC}: {same_soc})",
-        "dp_ratio " + ", ".join(f"{key} {dp_ratio_text(results, key)}" for key in keys),
+        "dp_ratio " + ", ".join(f"{names[key]} {dp_ratio_text(results, key)}" for key in keys),
     )
 
 
@@ -102,7 +105,9 @@ def convergences(results: StudyResults, key: str) -> list[Convergence]:
 def _compare(results: StudyResults, first: str, second: str) -> tuple[SpeedComparison, str]:
     rows = {key: convergences(results, key) for key in (first, second)}
     comparison = compare_speed(rows[first], rows[second], rng())
-    texts = [f"{key} {convergence_over_seeds(runs, rng()).text}" for key, runs in rows.items()]
+    texts = [
+        f"{row_name(key)} {convergence_over_seeds(runs, rng()).text}" for key, runs in rows.items()
+    ]
     saving = comparison.saving
     return comparison, (
         f"episodes {', '.join(texts)}: {percent_text(saving.value)} fewer "

@@ -105,14 +105,24 @@ def scores_of(results: StudyResults, key: str) -> FloatArray | None:
     """Share of the way from random feasible (0) to the exact optimum of the row's reward (1),
     shape (S,); None where a run or a reference is missing."""
     runs = results.of(key)
-    if not runs:
+    ends = _ends(results, runs[0].row.reward, runs[0].row.soc_min) if runs else None
+    if ends is None:
         return None
-    row = runs[0].row
-    floor = baseline_of(results, "random_feasible", row.reward, row.soc_min)
-    top = baseline_of(results, "optimum", row.reward, row.soc_min)
+    return (values_of(results, key, lambda o: o.reward_sum) - ends[0]) / (ends[1] - ends[0])
+
+
+def baseline_score(results: StudyResults, name: str, reward: str, soc_min: float) -> float | None:
+    """The same of a drive that does not learn."""
+    found, ends = baseline_of(results, name, reward, soc_min), _ends(results, reward, soc_min)
+    if found is None or ends is None:
+        return None
+    return (found.outcome.reward_sum - ends[0]) / (ends[1] - ends[0])
+
+
+def _ends(results: StudyResults, reward: str, soc_min: float) -> tuple[float, float] | None:
+    floor = baseline_of(results, "random_feasible", reward, soc_min)
+    top = baseline_of(results, "optimum", reward, soc_min)
     if floor is None or top is None:
         return None
-    span = top.outcome.reward_sum - floor.outcome.reward_sum
-    if span <= 0.0:
-        return None
-    return (values_of(results, key, lambda o: o.reward_sum) - floor.outcome.reward_sum) / span
+    low, high = floor.outcome.reward_sum, top.outcome.reward_sum
+    return (low, high) if low < high else None

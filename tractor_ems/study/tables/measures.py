@@ -6,53 +6,53 @@ from functools import lru_cache
 
 import numpy as np
 
-from tractor_ems.study.convergence import RowConvergence, converged, convergence_over_seeds
+from tractor_ems.study.convergence import (
+    RowConvergence,
+    converged,
+    convergence_over_seeds,
+    reached_optimum,
+)
+from tractor_ems.study.names import (
+    BASELINE_NAMES,
+    REWARD_NAMES,
+    ROW_NAMES,
+    SOC_MINS,
+    full_name,
+    reward_name,
+    row_name,
+    soc_min_of,
+    soc_min_text,
+)
 from tractor_ems.study.results import Baseline, Outcome, Run, StudyResults
 from tractor_ems.study.statistics import Interval, iqm_interval
 from tractor_sim.fuel import gallons
 
+__all__ = [
+    "ABLATIONS",
+    "ALSO_AGAINST",
+    "BASELINE_NAMES",
+    "NOT_RUN",
+    "REWARD_NAMES",
+    "ROW_NAMES",
+    "SOC_MINS",
+    "Measure",
+    "episodes_to_convergence",
+    "episodes_to_optimum",
+    "find_baseline",
+    "fuel_gal",
+    "full_name",
+    "measure",
+    "measure_values",
+    "reward_name",
+    "row_name",
+    "soc_min_of",
+    "soc_min_text",
+]
+
 NOT_RUN = "not run"
-SOC_MINS = (0.70, 0.836)
 
 _RNG_SEED = 20_260
 """Of every bootstrap here: the same results give the same tables."""
-
-ROW_NAMES: Mapping[str, str] = {
-    "q": "Q-learning",
-    "double_q": "double Q-learning",
-    "double_q_interpolated": "double Q, interpolated",
-    "dqn": "DQN",
-    "ddqn": "DDQN",
-    "ddqn_soft_target": "DDQN, soft target",
-    "ddqn_fuel_knots": "DDQN, engine knots",
-    "ddqn_shaped": "DDQN, shaped",
-    "ddqn_shaped_dp": "DDQN, shaped, DP seeds",
-    "ddqn_shaped_mixed": "DDQN, shaped, DP + rule seeds",
-    "ddqn_shaped_rule": "DDQN, shaped, rule seeds",
-    "ddqn_shaped_continuous_soc": "DDQN, shaped, continuous SOC",
-    "ddqn_shaped_knots": "DDQN, shaped, engine knots",
-    "ddqn_shaped_dp_kept": "DDQN, shaped, DP kept",
-    "ddqn_shaped_dp_margin": "DDQN, shaped, DP kept, margin",
-    "ddqn_corrected": "DDQN, corrected reward",
-    "ddqn_corrected_knots": "DDQN, corrected, engine knots",
-}
-
-BASELINE_NAMES: Mapping[str, str] = {
-    "conventional": "conventional",
-    "dp": "DP, least fuel to 83.6 %",
-    "best_point": "best point (engine at its best power)",
-    "rule_based": "rule base (engine above 110 kW)",
-    "random_feasible": "random feasible",
-    "myopic": "myopic greedy on the reward",
-    "optimum": "exact optimum of the reward",
-}
-
-REWARD_NAMES: Mapping[str, str] = {
-    "fuel": "fuel",
-    "piecewise": "shaped, as printed",
-    "piecewise_corrected": "shaped, corrected",
-    "equivalent_fuel": "equivalent fuel",
-}
 
 ABLATIONS: Sequence[tuple[str, Sequence[str]]] = (
     ("double_q@0.7", ("double_q_interpolated@0.7",)),
@@ -61,7 +61,14 @@ ABLATIONS: Sequence[tuple[str, Sequence[str]]] = (
     ("ddqn_shaped@0.836", ("ddqn_shaped_continuous_soc@0.836", "ddqn_shaped_knots@0.836")),
     ("ddqn_shaped_dp@0.836", ("ddqn_shaped_dp_kept@0.836", "ddqn_shaped_dp_margin@0.836")),
 )
-"""A row of the paper, and the rows that change one thing of it."""
+"""A row of the paper, and the rows that change something of it. Some change several things: the
+table computes which."""
+
+ALSO_AGAINST: Mapping[str, str] = {
+    "ddqn_shaped_dp_margin@0.836": "ddqn_shaped_dp_kept@0.836",
+    "ddqn_corrected_knots@0.7": "ddqn_corrected@0.7",
+}
+"""Ablations that have a nearer neighbour than the row of the paper."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +118,21 @@ def episodes_to_convergence(runs: Sequence[Run]) -> RowConvergence | None:
     return convergence_over_seeds(found, np.random.default_rng(_RNG_SEED))
 
 
+def episodes_to_optimum(results: StudyResults, runs: Sequence[Run]) -> RowConvergence | None:
+    """Episodes to 95 % of the way from random feasible to the exact optimum of the reward; None
+    where the row was not run or the study has no such references."""
+    if not runs:
+        return None
+    row = runs[0].row
+    low = find_baseline(results, "random_feasible", row.reward, row.soc_min)
+    high = find_baseline(results, "optimum", row.reward, row.soc_min)
+    if low is None or high is None or low.outcome.reward_sum >= high.outcome.reward_sum:
+        return None
+    ends = low.outcome.reward_sum, high.outcome.reward_sum
+    found = [reached_optimum(run.curve.episode, run.curve.eval_return, *ends) for run in runs]
+    return convergence_over_seeds(found, np.random.default_rng(_RNG_SEED))
+
+
 def find_baseline(
     results: StudyResults, name: str, reward: str = "fuel", soc_min: float = 0.70
 ) -> Baseline | None:
@@ -119,14 +141,3 @@ def find_baseline(
         return results.baseline(name, reward, soc_min)
     except KeyError:
         return None
-
-
-def row_name(key: str) -> str:
-    """What a reader calls the row of this key."""
-    name = key.split("@")[0]
-    return ROW_NAMES.get(name, name)
-
-
-def soc_min_of(key: str) -> float:
-    """SOC_min of a row key."""
-    return float(key.split("@")[1])

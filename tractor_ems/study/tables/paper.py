@@ -3,13 +3,13 @@ reason wherever the difference exceeds 2 %."""
 
 from collections.abc import Sequence
 
+from tractor_ems.study.findings import episodes_caveat
 from tractor_ems.study.paper_values import (
     DQN_DDQN_FUEL_GAL,
     PEARSON,
     SEEDING,
     SETTINGS,
     SUMMARY,
-    TABLE_1,
     TABLE_2,
     UNSHAPED_EFFICIENCY,
     MethodValue,
@@ -20,10 +20,12 @@ from tractor_ems.study.results import StudyResults
 from tractor_ems.study.statistics import strength_of
 from tractor_ems.study.tables.measures import (
     NOT_RUN,
+    REWARD_NAMES,
     SOC_MINS,
     find_baseline,
     measure_values,
     row_name,
+    soc_min_text,
 )
 from tractor_ems.study.tables.quantities import (
     DP_RATIO,
@@ -42,12 +44,11 @@ from tractor_ems.study.tables.quantities import (
     Quantity,
     measure_text,
     percent_text,
-    relative,
     signed,
 )
 from tractor_ems.study.tables.reasons import reason
 from tractor_ems.study.tables.table import Table
-from tractor_sim.fuel import gallons
+from tractor_ems.study.tables.table_1 import table_1
 
 _BASELINES = ("conventional", "dp")
 _MEASURED_ONLY = (FUEL_KG, DP_RATIO)
@@ -58,43 +59,56 @@ _HERE = (
 )
 
 
+_DP_RATIO = (
+    "`dp_ratio` is fuel of the optimum that ends at the row's own final SOC over the row's fuel."
+)
+_EPISODES = "`> N`: censored by the budget. Not comparable one to one with the paper, see below."
+
+
 def paper_tables(results: StudyResults) -> tuple[Table, ...]:
-    """Table 1, Table 2, the summary table in four parts, the seeding table, the tabular agents."""
-    four, all_rows = _entries(results, TABLE_2), _summary_entries(results)
+    """Table 1, Table 2, the summary table in four parts, the seeding table in two, the tabular
+    agents. A reason has one mark in all of them."""
+    four = [*_entries(results, TABLE_2), *_myopic(results, "fuel", "piecewise")]
+    all_rows, seeding = _summary_entries(results), _seeding_entries(results)
+    marks: dict[str, str] = {}
     return (
-        _table_1(results),
+        table_1(results),
         _compare(
             results,
             "table_2",
             "Table 2: four methods",
-            _HERE,
+            f"{_HERE} {_DP_RATIO}",
             four,
-            (FUEL, EFFICIENCY, SOC_FINAL),
+            (FUEL, FUEL_KG, EFFICIENCY, SOC_FINAL, DP_RATIO),
+            marks,
         ),
         _compare(
             results,
             "summary_fuel",
             "Summary table: fuel",
-            f"{_HERE} `dp_ratio` is fuel of the optimum that ends at the row's own final SOC over "
-            "the row's fuel.",
+            f"{_HERE} {_DP_RATIO}",
             all_rows,
             (FUEL, FUEL_KG, DP_RATIO),
+            marks,
         ),
         _compare(
             results,
             "summary_efficiency",
             "Summary table: efficiency and final SOC",
-            _HERE,
+            f"{_HERE} The difference from a printed range is counted from its nearer end.",
             all_rows,
             (EFFICIENCY, SOC_FINAL),
+            marks,
         ),
         _compare(
             results,
             "summary_episodes",
             "Summary table: episodes until convergence",
-            f"{_HERE} `> N`: censored by the budget.",
+            f"{_HERE} {_EPISODES}",
             [entry for entry in all_rows if entry.learner],
             (EPISODES,),
+            marks,
+            (episodes_caveat(results),),
         ),
         _compare(
             results,
@@ -104,14 +118,26 @@ def paper_tables(results: StudyResults) -> tuple[Table, ...]:
             "equal final SOC.",
             all_rows,
             (REDUCTION, FUEL_OF_DP, EFFICIENCY_OF_DP, DP_RATIO),
+            marks,
         ),
         _compare(
             results,
             "seeding",
-            "Seeding table",
+            "Seeding table: the drives",
             f"{_HERE} Rule-based seeding stands in the paper's text only.",
-            _seeding_entries(results),
-            (FUEL, EFFICIENCY, SOC_FINAL, EPISODES, DP_RATIO),
+            [*seeding, *_myopic(results, "piecewise")],
+            (FUEL, FUEL_KG, EFFICIENCY, SOC_FINAL, DP_RATIO),
+            marks,
+        ),
+        _compare(
+            results,
+            "seeding_episodes",
+            "Seeding table: episodes until convergence",
+            f"{_HERE} {_EPISODES}",
+            seeding,
+            (EPISODES,),
+            marks,
+            (episodes_caveat(results),),
         ),
         _tabular(results),
     )
@@ -124,6 +150,8 @@ def _compare(
     caption: str,
     entries: Sequence[Entry],
     quantities: Sequence[Quantity],
+    marks: dict[str, str],
+    notes: Sequence[str] = (),
 ) -> Table:
     columns = ["method", "SOC_min"]
     for quantity in quantities:
@@ -132,10 +160,10 @@ def _compare(
         else:
             columns += [f"{quantity.name}, {part}" for part in ("paper", "here", "difference")]
     columns.append(_REASON)
-    reasons: dict[str, str] = {}
+    used: dict[str, str] = {}
     rows = []
     for entry in entries:
-        cells = [entry.label, percent_text(entry.soc_min)]
+        cells = [entry.label, soc_min_text(entry.soc_min)]
         large = set()
         for quantity in quantities:
             compared = quantity.compare(results, entry)
@@ -150,25 +178,20 @@ def _compare(
             why = reason(
                 results, entry, drive=bool(large - {EPISODES}), episodes=EPISODES in large
             )
-        cells.append(_footnote(reasons, why))
+        if why:
+            used[why] = marks.setdefault(why, f"({len(marks) + 1})")
+        cells.append(used.get(why, NONE))
         rows.append(tuple(cells))
-    notes = [f"{mark} {why}." for why, mark in reasons.items()]
+    below = [*(f"{mark} {why}." for why, mark in used.items()), *notes]
     if DP_RATIO in quantities:
-        notes += _dp_notes(entries)
-    return Table(name, title, caption, tuple(columns), tuple(rows), tuple(notes))
-
-
-def _footnote(reasons: dict[str, str], why: str) -> str:
-    """A mark for the cell; reasons that several rows share are written once, below the table."""
-    if not why:
-        return NONE
-    return reasons.setdefault(why, f"({len(reasons) + 1})")
+        below += _dp_notes(entries)
+    return Table(name, title, caption, tuple(columns), tuple(rows), tuple(below))
 
 
 def _dp_notes(entries: Sequence[Entry]) -> tuple[str, ...]:
     """Why a drive has no dp_ratio."""
     found = {
-        f"{entry.label}, SOC_min {percent_text(entry.soc_min)}: no dp_ratio, {outcome.dp_note}"
+        f"{entry.label}, SOC_min {soc_min_text(entry.soc_min)}: no dp_ratio, {outcome.dp_note}"
         for entry in entries
         for outcome in entry.outcomes
         if outcome.dp_ratio is None and outcome.dp_note
@@ -196,15 +219,34 @@ def _of(results: StudyResults, row_id: str, label: str, printed: Printed) -> lis
     ]
 
 
+def _myopic(results: StudyResults, *rewards: str) -> list[Entry]:
+    """What looking at the next reward alone does, at every SOC_min that learners have."""
+    return [
+        Entry(
+            f"Myopic greedy, no learning, reward: {REWARD_NAMES[reward]}",
+            soc_min,
+            (),
+            found,
+            False,
+            Printed(),
+        )
+        for reward in rewards
+        for soc_min in (SOC_MINS if reward == "piecewise" else SOC_MINS[:1])
+        if (found := find_baseline(results, "myopic", reward, soc_min)) is not None
+    ]
+
+
 def _summary_entries(results: StudyResults) -> list[Entry]:
-    """The paper's six rows, and tabular double Q and DQN after the baselines."""
+    """The paper's six rows; the tabular agents, DQN and myopic greedy, which it has no row for."""
     dqn = Printed(DQN_DDQN_FUEL_GAL, UNSHAPED_EFFICIENCY, None, episodes_of("dqn"))
     entries = _entries(results, SUMMARY)
     return [
         *entries[:2],
+        *_of(results, "q", "Q-learning (no row in the paper)", Printed()),
         *_of(results, "double_q", "Double Q-learning (no row in the paper)", Printed()),
         *_of(results, "dqn", "DQN (text of the paper)", dqn),
         *entries[2:],
+        *_myopic(results, "fuel", "piecewise"),
     ]
 
 
@@ -214,65 +256,6 @@ def _seeding_entries(results: StudyResults) -> list[Entry]:
         *_entries(results, SEEDING),
         *_of(results, "ddqn_shaped_rule", "DDQN (RB data, text of the paper)", rule),
     ]
-
-
-def _table_1(results: StudyResults) -> Table:
-    here = {row.id: row for row in results.table1}
-    first = here.get("conventional")
-    rows = []
-    for printed in TABLE_1:
-        row = here.get(printed.id)
-        label = printed.label + (" (calibrated)" if printed.id == "conventional" else "")
-        if row is None:
-            soc = NONE if printed.soc_final is None else percent_text(printed.soc_final, 0)
-            rows.append((label, f"{printed.fuel_gal:.2f}", NOT_RUN, NONE, NONE, NONE, NONE, NONE,
-                         soc, NONE, NONE, NOT_RUN))  # fmt: skip
-            continue
-        fuel = gallons(row.fuel_kg)
-        gap = relative(printed.fuel_gal, fuel)
-        large = abs(gap) > LARGE
-        reduction = reduction_gap = NONE
-        if printed.reduction is not None and first is not None and first.fuel_kg > 0.0:
-            value = 1.0 - row.fuel_kg / first.fuel_kg
-            reduction = percent_text(value)
-            reduction_gap = f"{signed(100 * (value - printed.reduction), 1)} points"
-        soc_gap = NONE
-        if printed.soc_final is not None:
-            soc_gap = f"{signed(100 * (row.soc_final - printed.soc_final), 1)} points"
-            large = large or abs(relative(printed.soc_final, row.soc_final)) > LARGE
-        why = "cycle, battery and control rules are assumptions, the paper prints none of them"
-        rows.append(
-            (
-                label,
-                f"{printed.fuel_gal:.2f}",
-                f"{fuel:.3f}",
-                f"{signed(fuel - printed.fuel_gal, 3)} ({signed(100 * gap, 1)} %)",
-                f"{row.fuel_kg:.3f}",
-                NONE if printed.reduction is None else percent_text(printed.reduction),
-                reduction,
-                reduction_gap,
-                NONE if printed.soc_final is None else percent_text(printed.soc_final, 0),
-                NONE if printed.soc_final is None else percent_text(row.soc_final),
-                soc_gap,
-                why if large else NONE,
-            )
-        )
-    quantities = ("fuel [gal]", "less fuel than conventional", "final SOC")
-    fuel_columns, *others = (
-        [f"{name}, {part}" for part in ("paper", "here", "difference")] for name in quantities
-    )
-    columns = (
-        "control", *fuel_columns, "fuel [kg], here", *others[0], *others[1],
-        _REASON,
-    )  # fmt: skip
-    return Table(
-        "table_1",
-        "Table 1: 13-minute planter operation",
-        "Own configuration `paper_table1`: the plant of the other tables does not fit this one. "
-        "The two control rules are assumptions.",
-        columns,
-        tuple(rows),
-    )
 
 
 def _tabular(results: StudyResults) -> Table:
@@ -313,6 +296,11 @@ def _tabular(results: StudyResults) -> Table:
             f"Budget: {episodes_text(done)} of the paper's "
             f"{episodes_text(SETTINGS.tabular_episodes)} episodes."
         )
+    notes.append(
+        "Why r differs from the paper's: the pairs, the table (of two in double Q) and the "
+        "reward that it was taken over are not printed, nor is the schedule that decides which "
+        f"pairs are visited; {percent_text(LARGE, 0)} of it are {abs(LARGE * PEARSON):.3f}."
+    )
     notes.append(
         "The paper does not state over which pairs it correlates; here over pairs updated at "
         "least once, Q against the pair's reward."

@@ -9,6 +9,7 @@ from tractor_ems.study.tables.measures import (
     find_baseline,
     fuel_gal,
     measure_values,
+    soc_min_text,
 )
 from tractor_ems.study.tables.quantities import LARGE, Entry, percent_text
 
@@ -82,7 +83,7 @@ def _soc(entry: Entry) -> str:
     if paper is None or found is None or abs(found.interval.value - paper) <= SAME_SOC:
         return ""
     return (
-        f"with SOC_min {percent_text(entry.soc_min)} it ends at "
+        f"with SOC_min {soc_min_text(entry.soc_min)} it ends at "
         f"{percent_text(found.interval.value)}, not {percent_text(paper)}: fuels at different "
         "final SOC cannot be compared"
     )
@@ -95,4 +96,4 @@ def _speed(entry: Entry) -> str:
     if found.censored:
         why = sorted({run.reason for run in found.runs if run.reason})
         return f"{found.censored} of {len(found.runs)} seeds not converged ({', '.join(why)})"
-    return "convergence by this study's rule, the paper states none"
+    return "convergence by this study's rule and exploration schedule, the paper states neither"

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -74,9 +75,15 @@ def to_json(table: Table) -> dict[str, Any]:
 
 def _numbers(cells: Sequence[str]) -> bool:
     """Numbers are read down a column, so they are aligned to the right; text is not."""
-    filled = [cell for cell in cells if cell not in ("-", "", "not run")]
-    found = sum(cell.lstrip("+->( ")[:1].isdigit() for cell in filled)
-    return 2 * found > len(filled)
+    filled = [cell for cell in cells if cell not in ("-", "", "not run", "never")]
+    return 2 * sum(bool(_NUMBER.match(cell)) for cell in filled) > len(filled)
+
+
+_NUMBER = re.compile(
+    r"(more than )?[+\->]?\s?\d[\d,.]*(-\d[\d,.]*)?( (%|points|kWh|h|s))?( ?[\[(]|,|$)"
+)
+"""A number, with a unit, an interval or a remark after it; neither a mark like "(1)", nor a hash,
+a list of numbers or a sentence that begins with one."""
 
 
 def _line(cells: Sequence[str]) -> str:
