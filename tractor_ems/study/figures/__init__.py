@@ -6,21 +6,20 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from tractor_ems.study.figures.comparison import (
-    build_ablations,
-    build_convergence,
-    build_optimum,
-)
+from tractor_ems.study.figures.ablations import build_ablations
 from tractor_ems.study.figures.curves import build_curve
+from tractor_ems.study.figures.episodes import build_convergence
 from tractor_ems.study.figures.heatmap import build_heatmap
 from tractor_ems.study.figures.operating_points import (
     build_conventional_points,
     build_shaped_points,
 )
+from tractor_ems.study.figures.optimum import build_optimum
 from tractor_ems.study.figures.schematic import build_schematic
 from tractor_ems.study.figures.style import DPI, write_png_and_svg
 from tractor_ems.study.figures.tabular import build_pearson, build_tabular
 from tractor_ems.study.figures.traces import build_traces
+from tractor_ems.study.paper_values import episodes_of
 from tractor_ems.study.results import StudyResults
 
 __all__ = ["FIGURES", "FigureFile", "FigureSpec", "write_figures"]
@@ -58,11 +57,14 @@ def _curve(row_id: str, title: str, more: str = "") -> FigureSpec:
     def build(results: StudyResults) -> Figure:
         return build_curve(results, row_id, title)
 
+    where = (
+        "here; the paper prints none" if episodes_of(row_id) is None else "here and in the paper"
+    )
     return FigureSpec(
         f"reward_{row_id}",
         f"Reward curve, {title}",
         "Training return (exploration included) and greedy return, interquartile mean over seeds "
-        f"with a 95 % band, and the episode of convergence here and in the paper.{more}",
+        f"with a 95 % band, and the episode of convergence {where}.{more}",
         build,
     )
 
@@ -80,8 +82,8 @@ FIGURES: tuple[FigureSpec, ...] = (
     FigureSpec(
         "state_visits",
         "State visits of double Q-learning",
-        "Visits of every (SOC bin, demand bin) during training, median seed; white was never "
-        "visited.",
+        "Visits of every (SOC bin, demand bin) during training, median seed; light grey was "
+        "never visited. SOC over the window of the battery, demand over the range of the cycle.",
         build_heatmap,
     ),
     FigureSpec(
@@ -94,8 +96,8 @@ FIGURES: tuple[FigureSpec, ...] = (
     FigureSpec(
         "tabular",
         "Tabular agents",
-        "Greedy return over the tabular budget, share of the table's entries never visited, and "
-        "correlation over visited pairs; one dot a seed, numbers are medians.",
+        "Greedy return over the tabular budget; the median seed's table in three parts; "
+        "correlation over visited pairs, one dot a seed.",
         build_tabular,
     ),
     _curve("double_q", "double Q-learning"),
@@ -112,7 +114,8 @@ FIGURES: tuple[FigureSpec, ...] = (
     FigureSpec(
         "traces",
         "SOC, battery, engine and total power of DQN and DDQN",
-        "Final greedy drive of the median seed over the cycle, fuel reward.",
+        "Final greedy drive of the median seed over the cycle, fuel reward. Pale lines are the "
+        "steps, dark ones a running mean.",
         build_traces,
     ),
     FigureSpec(
@@ -125,26 +128,30 @@ FIGURES: tuple[FigureSpec, ...] = (
     FigureSpec(
         "points_ddqn_shaped",
         "Engine operating points, DDQN with the shaped reward",
-        "As above, median seed." + _TWO,
+        "As above, same scale, median seed." + _TWO,
         build_shaped_points,
     ),
     FigureSpec(
         "optimum",
         "True optimum of each reward",
-        "Exact DP on the reward itself, by SOC_min, beside the paper's rows. Not in the paper.",
+        "Exact DP on the reward itself, and greed on each step's reward, by SOC_min, beside the "
+        "paper's rows. Lines in the right panel run from the initial to the final SOC, on an axis "
+        "that does not begin at 0. Not in the paper.",
         build_optimum,
     ),
     FigureSpec(
         "convergence",
         "Episodes until convergence",
-        "One rule for every curve. Interquartile mean, 95 % interval and seeds; a triangle is a "
-        "lower bound. Not in the paper.",
+        "One rule for every curve. Interquartile mean, 95 % interval and seeds, one lane each; a "
+        "triangle is a lower bound. The paper prints no episode for the tabular agents.",
         build_convergence,
     ),
     FigureSpec(
         "ablations",
-        "What each single change does",
-        "Interquartile mean, 95 % interval and seeds. Not in the paper.",
+        "Ablations beside the row they vary",
+        "Interquartile mean, 95 % interval and seeds, with myopic greedy and the best point under "
+        "the same reward and SOC_min, and what the paper prints for a row of its own. Some "
+        "variations change more than one setting, see the rows' settings. Not in the paper.",
         build_ablations,
     ),
 )

@@ -7,25 +7,25 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tractor_ems.learning.rewards import RewardKind
+from tractor_ems.learning.rewards import RewardConfig, RewardKind
 from tractor_ems.study.convergence import converged, convergence_over_seeds
 from tractor_ems.study.figures.style import (
+    BLACK,
     BLUE,
     GREEN,
     GREY,
-    ORANGE,
     PINK,
     VERMILION,
-    count_episodes,
     look,
     new_figure,
     percent,
     say_not_run,
     thousands,
+    use_thousands,
 )
 from tractor_ems.study.paper_values import episodes_of
 from tractor_ems.study.results import Run, StudyResults
-from tractor_ems.study.statistics import iqm_band
+from tractor_ems.study.statistics import interquartile_mean, iqm_band
 from tractor_msgs_py.trajectory import FloatArray
 
 _POINTS = 300
@@ -34,17 +34,29 @@ _POINTS = 300
 _RESAMPLES = 400
 """For a band in a picture; tables use more."""
 
-_UNITS: dict[RewardKind, str] = {
-    "fuel": "10 g of fuel",
-    "piecewise": "-",
-    "piecewise_corrected": "-",
-    "equivalent_fuel": "10 g of fuel",
+_LABELS: dict[RewardKind, str] = {
+    "fuel": "return of an episode: −fuel [kg]",
+    "piecewise": "return of an episode [-]",
+    "piecewise_corrected": "return of an episode [-]",
+    "equivalent_fuel": "return of an episode: −equivalent fuel [kg]",
 }
 
 
-def return_label(reward: RewardKind, what: str = "return") -> str:
+def return_label(reward: RewardKind) -> str:
     """Axis label of a sum of rewards over one episode, with its unit."""
-    return f"{what} of an episode [{_UNITS[reward]}]"
+    return _LABELS[reward]
+
+
+def return_scale(reward: RewardKind) -> float:
+    """From what a learner sees, where 10 g of fuel count 1, to the unit of the label."""
+    return RewardConfig(kind=reward).cost_unit
+
+
+def return_text(reward: RewardKind, value: float) -> str:
+    """A sum of rewards as a learner sees it, in the label's unit: ``−0.52 kg``."""
+    shown = value * return_scale(reward)
+    text = f"{shown:,.0f}" if reward.startswith("piecewise") else f"{shown:.2f} kg"
+    return text.replace("-", "−")
 
 
 def build_curve(results: StudyResults, row_id: str, name: str) -> Figure:
@@ -60,7 +72,7 @@ def build_curve(results: StudyResults, row_id: str, name: str) -> Figure:
         figure = new_figure(3.9 * len(limits) + 0.3)
         panels = np.atleast_1d(figure.subplots(len(limits), 1))
         for axes, soc_min in zip(panels, limits, strict=True):
-            title = f"{name}, SOC_min {percent(soc_min)}" if shaped else name
+            title = f"{name}, SOC_min {percent(soc_min)}"
             _panel(axes, results, f"{row_id}@{soc_min:g}", title)
     return figure
 
@@ -76,10 +88,14 @@ def _panel(axes: Axes, results: StudyResults, key: str, title: str) -> None:
         return
     row = runs[0].row
     axes.set_ylabel(return_label(row.reward))
+    axes.set_title(f"{title}: {_budget(results, runs)}")
     seeds = f"IQM of {len(runs)} seeds,\n95 % band" if len(runs) > 1 else "1 seed"
     draw_training(axes, runs, GREY, "training")
-    draw_evaluations(axes, runs, BLUE, "greedy")
-    count_episodes(axes.xaxis)
+    last = draw_evaluations(axes, runs, BLUE, "greedy")
+    axes.lines[-1].set_label(f"greedy, last {return_text(row.reward, last)}")
+    use_thousands(axes.xaxis)
+    if row.reward.startswith("piecewise"):
+        use_thousands(axes.yaxis)
     reference_lines(axes, results, row.reward, row.soc_min)
     axes.set_xlim(0, max(run.episodes for run in runs) * 1.005)
     _mark_convergence(axes, runs)
@@ -93,6 +109,13 @@ def _panel(axes: Axes, results: StudyResults, key: str, title: str) -> None:
     )
 
 
+def _budget(results: StudyResults, runs: Sequence[Run]) -> str:
+    episodes = f"{thousands(max(run.episodes for run in runs))} episodes"
+    if runs[0].row.tabular:
+        return episodes
+    return f"{episodes}, 1 update per {results.steps_per_update} steps"
+
+
 def draw_training(axes: Axes, runs: Sequence[Run], colour: str, label: str) -> None:
     """IQM of the training return over seeds, averaged over blocks of episodes, with its band."""
     shared = min(len(run.curve.train_return) for run in runs)
@@ -102,40 +125,52 @@ def draw_training(axes: Axes, runs: Sequence[Run], colour: str, label: str) -> N
     blocks = np.stack([_block_means(run.curve.train_return[:shared], block) for run in runs])
     ends = np.minimum(np.arange(1, blocks.shape[1] + 1) * block, shared)
     centre = ends - (np.diff(ends, prepend=0) - 1) / 2
-    _draw_band(axes, centre, blocks, colour, label, 1.0)
+    _draw_band(axes, centre, blocks * return_scale(runs[0].row.reward), colour, label, 1.0)
 
 
-def draw_evaluations(axes: Axes, runs: Sequence[Run], colour: str, label: str) -> None:
-    """IQM of the greedy return over seeds at the evaluations that all runs share."""
+def draw_evaluations(axes: Axes, runs: Sequence[Run], colour: str, label: str) -> float:
+    """IQM of the greedy return over seeds at the evaluations that all runs share; returns the
+    last one, as a learner sees it."""
     shared = runs[0].curve.episode
     for run in runs[1:]:
         shared = np.intersect1d(shared, run.curve.episode)
     returns = np.stack([run.curve.eval_return[np.isin(run.curve.episode, shared)] for run in runs])
-    _draw_band(axes, shared.astype(np.float64), returns, colour, label, 1.8)
+    scale = return_scale(runs[0].row.reward)
+    _draw_band(axes, shared.astype(np.float64), returns * scale, colour, label, 1.8)
+    return float(interquartile_mean(returns[:, -1]))
 
 
 def reference_lines(axes: Axes, results: StudyResults, reward: RewardKind, soc_min: float) -> None:
-    """Exact optimum, greedy on the reward, and random, where the study has them."""
-    for name, label, colour, style in (
-        ("optimum", "exact optimum", GREEN, "-"),
-        ("myopic", "myopic greedy", ORANGE, "--"),
-        ("random_feasible", "random", PINK, ":"),
+    """Exact optimum, greedy on the reward, and random, where the study has them, with their
+    values: optimum and myopic greedy can be closer than a line is wide."""
+    for name, label, colour, style, width in (
+        ("optimum", "exact optimum", GREEN, "-", 3.5),
+        ("myopic", "myopic greedy", BLACK, "--", 1.2),
+        ("random_feasible", "random", PINK, ":", 1.6),
     ):
         try:
             level = results.baseline(name, reward, soc_min).outcome.reward_sum
         except KeyError:
             continue
-        axes.axhline(level, color=colour, linestyle=style, linewidth=1.6, label=label)
+        axes.axhline(
+            level * return_scale(reward), color=colour, linestyle=style, linewidth=width,
+            alpha=0.55 if name == "optimum" else 1.0,
+            label=f"{label} {return_text(reward, level)}",
+        )  # fmt: skip
+    # axhline makes room for itself where it lies outside the axes, and none for the margin.
+    axes.margins(y=0.06)
+    axes.autoscale_view(scalex=False)
 
 
 def _mark_convergence(axes: Axes, runs: Sequence[Run]) -> None:
     found = [converged(run.curve.episode, run.curve.eval_return) for run in runs]
     row = convergence_over_seeds(found, np.random.default_rng(0), _RESAMPLES)
-    if row.censored == len(found):
-        label = "here: not converged"
-        axes.plot([], [], " ", label=label)
+    if row.lower_bound:  # an episode at which nothing happened is no line
+        axes.plot([], [], " ", label=f"not converged:\n{row.censored} of {len(found)} seeds")
         return
-    label = f"here, converged: {row.text.split(' [')[0].split(' (')[0]}"
+    label = f"here, converged: {thousands(row.episodes.value)}"
+    if row.censored:
+        label += f"\n({row.censored} of {len(found)} seeds did not)"
     axes.axvline(row.episodes.value, color=BLUE, linestyle="-.", linewidth=1.3, label=label)
 
 
@@ -159,6 +194,7 @@ def _mark_paper(axes: Axes, episodes: int | None) -> None:
         transform=axes.transAxes,
         color="#a34700",
         va="bottom",
+        bbox={"boxstyle": "square,pad=0.3", "facecolor": "white", "edgecolor": "#a34700"},
     )
 
 

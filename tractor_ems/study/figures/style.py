@@ -91,9 +91,9 @@ def say_not_run(axes: Axes, what: str) -> None:
     )
 
 
-def count_episodes(axis: Axis) -> None:
-    """Tick labels as the paper writes episodes."""
-    axis.set_major_formatter(FuncFormatter(lambda value, _: thousands(value)))
+def use_thousands(axis: Axis) -> None:
+    """Tick labels as the paper writes numbers."""
+    axis.set_major_formatter(FuncFormatter(lambda value, _: thousands(value).replace("-", "−")))
 
 
 def thousands(value: float) -> str:

@@ -6,28 +6,40 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
-from tractor_ems.study.figures.curves import draw_evaluations, reference_lines, return_label
+from tractor_ems.learning.tabular import TableStudy
+from tractor_ems.study.figures.curves import (
+    draw_evaluations,
+    reference_lines,
+    return_label,
+    return_scale,
+    return_text,
+)
 from tractor_ems.study.figures.style import (
     BLACK,
     BLUE,
     GREY,
+    ORANGE,
+    SKY,
     VERMILION,
-    count_episodes,
     look,
     new_figure,
     say_not_run,
+    use_thousands,
 )
 from tractor_ems.study.figures.traces import median_run
 from tractor_ems.study.paper_values import PEARSON, PEARSON_SCALE
-from tractor_ems.study.results import Run, StudyResults, TableStudy
+from tractor_ems.study.results import Run, StudyResults
 from tractor_ems.study.statistics import strength_of
 
 _AGENTS = (
-    ("q@0.7", "Q-learning", BLACK),
+    ("q@0.7", "Q-learning", ORANGE),
     ("double_q@0.7", "double Q", BLUE),
-    ("double_q_interpolated@0.7", "double Q,\ninterpolated", VERMILION),
+    ("double_q_interpolated@0.7", "double Q,\ninterpolated", SKY),
 )
+
+_TO_G = 1e3 * return_scale("fuel")
 
 
 def build_pearson(results: StudyResults) -> Figure:
@@ -36,14 +48,14 @@ def build_pearson(results: StudyResults) -> Figure:
     with look():
         figure = new_figure(6.4)
         axes, scale = figure.subplots(2, 1, height_ratios=(3.2, 1))
-        axes.set(xlabel="reward of the pair [10 g of fuel]", ylabel="Q [10 g of fuel]")
+        axes.set(xlabel="reward of the pair: −fuel of the step [g]", ylabel="Q [g of fuel]")
         axes.grid()
         if runs:
             run = median_run(runs)
             table = _table(run)
             axes.scatter(
-                table.sample_reward,
-                table.sample_q,
+                table.sample_reward * _TO_G,
+                table.sample_q * _TO_G,
                 s=4,
                 color=BLUE,
                 alpha=0.35,
@@ -98,84 +110,87 @@ def _strength_scale(axes: Axes, runs: Sequence[Run]) -> None:
 
 
 def build_tabular(results: StudyResults) -> Figure:
-    """Greedy return over the tabular budget, pairs never visited, and Pearson per agent."""
+    """Greedy return over the tabular budget, what of the table was visited, and Pearson."""
     agents = [(name, colour, runs) for key, name, colour in _AGENTS if (runs := results.of(key))]
     with look():
-        figure = new_figure(7.2)
-        grid = figure.add_gridspec(2, 2, height_ratios=(1.5, 1))
+        figure = new_figure(7.0)
+        grid = figure.add_gridspec(2, 2, height_ratios=(1.7, 1), width_ratios=(1.25, 1))
         curve = figure.add_subplot(grid[0, :])
-        never, pearson = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
-        curve.set(xlabel="training episodes [-]", ylabel=return_label("fuel", "greedy return"))
-        never.set(xlabel="pairs never visited [% of all entries]", xlim=(0, 100))
+        visited, pearson = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
+        curve.set(xlabel="training episodes [-]", ylabel=return_label("fuel"))
+        visited.set(xlabel="pairs [% of all entries of the table]", xlim=(0, 100))
         pearson.set(xlabel="Pearson r of Q and reward [-]", xlim=(-1, 1))
-        for axes in (curve, never, pearson):
-            axes.grid()
+        curve.grid()
+        pearson.grid(axis="x")
         if not agents:
-            for axes in (curve, never, pearson):
+            for axes in (curve, visited, pearson):
                 say_not_run(axes, "tabular agents")
             return figure
         for name, colour, runs in agents:
-            draw_evaluations(curve, runs, colour, name.replace("\n", " "))
+            last = return_text("fuel", draw_evaluations(curve, runs, colour, name))
+            curve.lines[-1].set_label(f"{name}, last {last}".replace("\n", " "))
         reference_lines(curve, results, "fuel", 0.70)
-        count_episodes(curve.xaxis)
-        figure.suptitle(
-            f"Greedy drive during {results.episodes_tabular:,} tabular episodes, IQM over seeds",
-            x=0.01, ha="left", fontsize=11,
-        )  # fmt: skip
-        curve.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, columnspacing=1.2)
+        use_thousands(curve.xaxis)
+        curve.set_title(
+            f"Greedy drive during {results.episodes_tabular:,} episodes, IQM over seeds, 95 % band"
+        )
+        figure.legend(*curve.get_legend_handles_labels(), loc="outside upper left", ncols=2)
         curve.set_xlim(0, max(run.episodes for _, _, runs in agents for run in runs))
         for place, (_, colour, runs) in enumerate(agents):
-            _dots(never, place, [_never(run) for run in runs], colour, "%")
-            found = [table.pearson for run in runs if (table := _table(run)).pearson is not None]
-            _dots(pearson, place, found, colour, "")
-        pearson.axvline(PEARSON, color=VERMILION, linestyle="--", linewidth=1)
-        pearson.text(
-            PEARSON - 0.04,
-            -0.62,
-            f"paper {PEARSON}".replace("-", "−"),
-            color="#a34700",
-            ha="right",
-            va="center",
-            fontsize=9.5,
-        )
-        for axes in (never, pearson):
-            axes.set_ylim(len(agents) - 0.4, -0.95)
+            _shares(visited, place, runs, colour)
+            _correlations(pearson, place, runs, colour)
+            if runs[0].row.id == "double_q":  # the paper prints it for this agent alone
+                label = f"paper {PEARSON}".replace("-", "−")
+                pearson.plot([PEARSON], [place + 0.3], "D", color=VERMILION, markersize=6)
+                pearson.text(PEARSON + 0.07, place + 0.3, label, color="#a34700", ha="left",
+                             va="center", fontsize=9.5)  # fmt: skip
+        for axes in (visited, pearson):
+            axes.set_ylim(len(agents) - 0.45, -0.55)
             axes.set_yticks(range(len(agents)), [name for name, _, _ in agents])
-        pearson.tick_params(labelleft=False)
+            axes.tick_params(axis="y", length=0)
+        _legend_of_shares(visited)
+        pearson.set_title("one dot a seed, median")
     return figure
 
 
-def _dots(axes: Axes, place: int, values: Sequence[float], colour: str, unit: str) -> None:
+_SHADES = (("never visited, feasible", "#9a9a9a"), ("not feasible", "#e4e4e4"))
+
+
+def _shares(axes: Axes, y: float, runs: Sequence[Run], colour: str) -> None:
+    """The median seed's table in three parts: visited, feasible but never visited, the rest."""
+    table = sorted((_table(run) for run in runs), key=lambda table: table.pairs_visited)[
+        (len(runs) - 1) // 2
+    ]
+    visited, feasible = table.pairs_visited, max(table.pairs_feasible, table.pairs_visited)
+    parts = 100.0 * np.diff([0, visited, feasible, table.pairs]) / table.pairs
+    left = 0.0
+    for part, shade in zip(parts, (colour, *(shade for _, shade in _SHADES)), strict=True):
+        axes.barh([y], [part], left=left, height=0.42, color=shade)
+        at, where = (0.0, "left") if left == 0.0 else (left + part / 2, "center")
+        axes.text(at, y - 0.24, f"{part:.1f} %", ha=where, va="bottom", fontsize=9.5)
+        left += part
+
+
+def _legend_of_shares(axes: Axes) -> None:
+    handles = [Patch(facecolor=BLUE, edgecolor=ORANGE, linewidth=1.5, label="visited")]
+    handles += [Patch(facecolor=shade, label=name) for name, shade in _SHADES]
+    axes.legend(
+        handles=handles, loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=3, borderaxespad=0.1,
+        columnspacing=0.8, handlelength=1.0, handletextpad=0.4,
+    )  # fmt: skip
+
+
+def _correlations(axes: Axes, y: float, runs: Sequence[Run], colour: str) -> None:
+    """One dot a seed; the median stands above, where no mark of the paper lies."""
+    values = [table.pearson for run in runs if (table := _table(run)).pearson is not None]
     if not values:
-        axes.text(0.5, place, "undefined", transform=axes.get_yaxis_transform(), va="center")
+        axes.text(0.0, y, "undefined", ha="center", va="center")
         return
-    axes.plot(
-        values,
-        np.full(len(values), place),
-        "o",
-        color=colour,
-        alpha=0.7,
-        markersize=7,
-        clip_on=False,
-    )
+    axes.plot(values, np.full(len(values), y), "o", color=colour, alpha=0.7, markersize=7,
+              clip_on=False)  # fmt: skip
     middle = float(np.median(values))
-    text = f"{middle:.2f} {unit}".strip().replace("-", "−")
-    low, high = axes.get_xlim()
-    right = middle > (low + high) / 2
-    gap = (high - low) * 0.05
-    axes.text(
-        min(values) - gap if right else max(values) + gap,
-        place,
-        text,
-        ha="right" if right else "left",
-        va="center",
-        fontsize=10,
-    )
-
-
-def _never(run: Run) -> float:
-    table = _table(run)
-    return 100.0 * (1.0 - table.pairs_visited / table.pairs)
+    text = f"{middle:+.2f}".replace("-", "−")
+    axes.text(min(max(middle, -0.85), 0.85), y - 0.16, text, ha="center", va="bottom", fontsize=10)
 
 
 def _table(run: Run) -> TableStudy:
