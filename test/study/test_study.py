@@ -83,5 +83,5 @@ def test_sittings_that_are_damaged_are_refused(
     run_study(config, tmp_path, workers=1, stage=quiet)
     assert json.loads((tmp_path / "sittings.json").read_text())[0]["preset"] == "smoke"
     (tmp_path / "sittings.json").write_text("{")
-    with pytest.raises(ConfigError, match="sittings.json: cannot be read"):
+    with pytest.raises(ConfigError, match=r"sittings\.json: cannot be read"):
         collect(config, tmp_path)

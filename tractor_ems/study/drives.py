@@ -45,12 +45,14 @@ def read_drives(bags: Sequence[Path], params: PowertrainParams) -> tuple[Drive, 
 
 
 def _read(bags: Sequence[Path], params: PowertrainParams) -> tuple[Drive, ...]:
+    """One by one, so that the order is the bags' and not that of hashes, which a command line
+    recorded in them would change."""
     drives = []
-    for trace in read_recordings(bags, [], params).traces:
-        drive = drive_of_trace(trace)
-        if drive is None:
-            raise BagError(f"{trace.bag}: holds no whole driven run; remove it and run again")
-        drives.append(drive)
+    for bag in bags:
+        found = [drive_of_trace(trace) for trace in read_recordings([bag], [], params).traces]
+        if len(found) != 1 or found[0] is None:
+            raise BagError(f"{bag}: holds no whole driven run; remove it and run again")
+        drives.append(found[0])
     return tuple(drives)
 
 
@@ -68,7 +70,7 @@ def _load(path: Path, key: str) -> tuple[Drive, ...] | None:
                         for field in fields(Drive)
                         if field.name != "soc_target"
                     },
-                    soc_target=float(file.get_tensor(f"{number}.soc_target")),
+                    soc_target=file.get_tensor(f"{number}.soc_target").item(),
                 )
                 for number in range(count)
             )

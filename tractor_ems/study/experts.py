@@ -37,6 +37,9 @@ EDGE_W = 25.0
 """A recorded power this close to lb or ub is lb or ub: half a float32 step of SOC is 20 W of a
 185 kWh battery over one second."""
 
+SEEDING = 2
+"""Raise when the same bags seed a replay otherwise: part of a seeded run's hash."""
+
 RECORDING = 1
 """Raise when the same expert drives otherwise: bags are then recorded anew."""
 

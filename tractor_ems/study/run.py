@@ -34,7 +34,7 @@ from tractor_ems.learning.tabular import TableStudy
 from tractor_ems.policies.protocol import ANY_RUN
 from tractor_ems.study.baselines import outcome_of, reward_config
 from tractor_ems.study.config import StudyConfig
-from tractor_ems.study.experts import plant, seeds
+from tractor_ems.study.experts import SEEDING, plant, seeds
 from tractor_ems.study.results import Curve, Run
 from tractor_ems.study.rows import Row
 from tractor_ems.study.store import save_run
@@ -74,6 +74,8 @@ def config_hash(config: StudyConfig, row: Row, seed: int) -> str:
         "powertrain_hash": powertrain_hash(plant(config, row.soc_min)),
         "cycle_hash": cycle_hash(load_cycle(config.cycle)),
     }
+    if row.seeding != "none":
+        identity["seeding"] = SEEDING
     return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
 
 
