@@ -12,7 +12,7 @@ from study.synthetic import DEFAULT_PLANS, Plan, build_results
 from tractor_ems.study.claims import claims
 from tractor_ems.study.figures import FIGURES, FigureFile
 from tractor_ems.study.report import report_text, write_report
-from tractor_ems.study.results import StudyResults
+from tractor_ems.study.results import Baseline, StudyResults
 from tractor_ems.study.tables import build_tables
 
 DPI = 20
@@ -115,13 +115,61 @@ def test_the_report_says_how_it_was_made(results: StudyResults, text: str):
 
 
 def test_what_the_paper_left_out_is_named(results: StudyResults):
-    printed = {"subject": "batch size", "paper": "64", "here": "32", "why": "made up"}
-    text = text_of(replace(results, differences=(*results.differences, printed)))
-    summary = text.split("## How it was made")[0]
-    assert "**What the paper left out** (choices and reasons below): gamma; engine map." in summary
-    assert (
-        "**Done otherwise than in the paper** (choices and reasons below): batch size" in summary
+    """By the kind of the difference, whatever words its cells have."""
+    said = {"paper": "not so", "here": "32", "why": "made up"}
+    more = (
+        {"subject": "batch size", "kind": "different", **said},
+        {"subject": "sign", "kind": "slip", **said},
     )
+    text = text_of(replace(results, differences=(*results.differences, *more)))
+    summary = text.split("## How it was made")[0]
+    for part in (
+        "**What the paper left out** (choices and reasons below): gamma; engine map.",
+        "**Done otherwise than in the paper** (choices and reasons below): batch size.",
+        "**Put right, because the paper has a slip** (choices and reasons below): sign.",
+    ):
+        assert part in summary
+
+
+def test_the_report_opens_with_the_paper_and_what_was_found(text: str):
+    opening, summary = text.split("## How it was made")[0].split("## Summary")
+    for part in ("Improving\nQ-Learning for Real-World Control", "Abououf", "Bhatti", "Ahmed"):
+        assert part in opening
+    found = summary.split("**What was found**")[1].split("**Budget.**")[0]
+    sentences = [line for line in found.splitlines() if line.startswith("- ")]
+    assert 3 <= len(sentences) <= 6
+    assert "DDQN converges sooner than DQN: **holds**" in found
+    slow = {**DEFAULT_PLANS, "dqn": Plan(0.2, "low_power"), "ddqn": Plan(0.7, "low_power")}
+    other = text_of(build_results(plans=slow))
+    assert "DDQN converges sooner than DQN: **does not hold**" in other
+
+
+def test_the_summary_says_what_the_budget_allows(results: StudyResults):
+    told = replace(results, provenance={**results.provenance, "epsilon_decay_share": 0.5})
+    budget = text_of(told).split("**Budget.**")[1].split("\n\n")[0]
+    for part in ("60 episodes", "11,490 updates", "9,000 to 40,000", "until episode 30",
+                 "not comparable one to one", "confirms no speed"):  # fmt: skip
+        assert part in budget, part
+
+
+def test_soc_min_explains_the_equal_final_soc_only_if_the_optimum_ends_there(
+    results: StudyResults,
+):
+    assert "no single bound gives both rows" in text_of(results)
+
+    def held(item: Baseline) -> Baseline:
+        if (item.id, item.reward) != ("optimum", "piecewise"):
+            return item
+        return replace(item, outcome=replace(item.outcome, soc_final=0.85))
+
+    charged = replace(results, baselines=tuple(held(item) for item in results.baselines))
+    assert "a bound alone does not explain" in text_of(charged)
+
+
+def test_a_note_is_written_once(text: str):
+    notes = [line for line in text.splitlines() if re.match(r"- (\(\d+\) |\*\*SOC_min and)", line)]
+    assert len(notes) == len(set(notes)) > 3
+    assert text.count("**SOC_min and the equal final SOC.**") == 1
 
 
 @pytest.mark.parametrize("gone", [("ddqn_shaped@0.7", "dqn@0.7"), ("ddqn_shaped@0.836",)])

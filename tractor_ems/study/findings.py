@@ -8,7 +8,7 @@ from tractor_ems.study.names import BASELINE_NAMES, SOC_MINS, soc_min_text
 from tractor_ems.study.paper_values import CONVERGENCE, SUMMARY, episodes_text, percent_text
 from tractor_ems.study.results import Baseline, Outcome, Run, StudyResults
 from tractor_ems.study.speed_claims import SAME_SOC
-from tractor_ems.study.verdicts import baseline_of, baseline_score, dp_ratio_text, iqm_text
+from tractor_ems.study.verdicts import OPEN, baseline_of, baseline_score, dp_ratio_text, iqm_text
 from tractor_sim.fuel import gallons
 
 
@@ -30,7 +30,7 @@ def what_was_found(results: StudyResults) -> tuple[str, ...]:
     first = by_id["ddqn_faster"][0]
     return (
         f"DDQN converges sooner than DQN: **{first.verdict}**, within this budget and schedule "
-        f"({first.evidence.split('; ')[0]}).",
+        f"({'; '.join(first.evidence.split('; ')[: 2 if first.verdict == OPEN else 1])}).",
         said("Double Q-learning in a table is unsuitable", "double_q_unsuitable")
         + " "
         + said("Q-learning in a table is too", "q_unsuitable")
@@ -98,7 +98,7 @@ def episodes_caveat(results: StudyResults) -> str:
     budget = episodes_text(results.episodes_deep)
     return (
         f'"Converged" means within this budget of {budget} episodes and its exploration '
-        "schedule, most of which the curve follows: episodes here and in the paper are not "
+        "schedule, which is tied to the budget: episodes here and in the paper are not "
         "comparable one to one. A censored or shorter number confirms no speed in the paper's "
         "terms; only rows of this study compare with each other."
     )

@@ -18,9 +18,12 @@ from tractor_ems.study.verdicts import (
     Found,
     Verdict,
     all_hold,
+    baseline_score,
     dp_ratio_text,
+    iqm_text,
     join,
     rng,
+    scores_of,
     unresolved,
     values_of,
     within,
@@ -63,7 +66,21 @@ def all_converge(results: StudyResults, keys: Sequence[str]) -> Found:
     reasons = {run.reason for runs in rows.values() for run in runs if run.episodes is None}
     if reasons:
         return unresolved(join(*sorted(reasons), numbers))
-    return "holds", numbers
+    return "holds", join(numbers, *(_settled_where(results, key) for key in keys))
+
+
+def _settled_where(results: StudyResults, key: str) -> str:
+    """A settled curve need not be a good one."""
+    scores = scores_of(results, key)
+    if scores is None:
+        return ""
+    row = results.of(key)[0].row
+    alone = baseline_score(results, "myopic", row.reward, row.soc_min)
+    beside = "" if alone is None else f" (myopic greedy, which learns nothing: {alone:.3f})"
+    return (
+        f"{row_name(key)} settles at {iqm_text(scores)} of the way from random to the optimum "
+        f"of its reward{beside}, dp_ratio {dp_ratio_text(results, key)}"
+    )
 
 
 def speed_not_optimality(results: StudyResults, keys: Sequence[str]) -> Found:

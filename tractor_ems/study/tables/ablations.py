@@ -74,8 +74,8 @@ def ablations_table(results: StudyResults) -> Table:
         "Each block: a row of the paper (bold), then rows of ours with the row that each is "
         "compared with and **every** setting in which the two differ; some change several at "
         "once, and then no one of them is to thank or to blame. Run at the SOC_min shown only. "
-        f"`to 95 %`: episodes until the greedy return stays at {100 * SOLVED:.0f} % of the way "
-        "from random feasible to the exact optimum of the reward, where `episodes` asks only "
+        f"The last column: episodes until the greedy return stays at {100 * SOLVED:.0f} % of the "
+        "way from random feasible to the exact optimum of the reward, where `episodes` asks only "
         "that the curve has settled.",
         (
             "row",

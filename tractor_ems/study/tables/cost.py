@@ -28,7 +28,7 @@ def speed_table(results: StudyResults) -> Table | None:
     return Table(
         "speed",
         "Speed",
-        "Timed on their own, with nothing else running.",
+        "Timed by themselves, apart from the runs of the study.",
         ("what", "per second", "unit"),
         tuple((str(m["what"]), f"{m['per_s']:,.0f}", str(m["unit"])) for m in measured),
     )

@@ -53,12 +53,8 @@ from tractor_ems.study.tables.table_1 import table_1
 _BASELINES = ("conventional", "dp")
 _MEASURED_ONLY = (FUEL_KG, DP_RATIO)
 _REASON = f"reason, above {percent_text(LARGE, 0)}"
-_HERE = (
-    "Here: interquartile mean over seeds [95 % bootstrap interval]. Conventional and DP are "
-    "calibrated, not reproduced."
-)
-
-
+_INTERVAL = "Here: interquartile mean over seeds [95 % bootstrap interval]."
+_HERE = f"{_INTERVAL} Conventional and DP are calibrated, not reproduced."
 _DP_RATIO = (
     "`dp_ratio` is fuel of the optimum that ends at the row's own final SOC over the row's fuel."
 )
@@ -104,7 +100,7 @@ def paper_tables(results: StudyResults) -> tuple[Table, ...]:
             results,
             "summary_episodes",
             "Summary table: episodes until convergence",
-            f"{_HERE} {_EPISODES}",
+            f"{_INTERVAL} {_EPISODES}",
             [entry for entry in all_rows if entry.learner],
             (EPISODES,),
             marks,
@@ -124,7 +120,7 @@ def paper_tables(results: StudyResults) -> tuple[Table, ...]:
             results,
             "seeding",
             "Seeding table: the drives",
-            f"{_HERE} Rule-based seeding stands in the paper's text only.",
+            f"{_INTERVAL} {_DP_RATIO} Rule-based seeding stands in the paper's text only.",
             [*seeding, *_myopic(results, "piecewise")],
             (FUEL, FUEL_KG, EFFICIENCY, SOC_FINAL, DP_RATIO),
             marks,
@@ -133,7 +129,7 @@ def paper_tables(results: StudyResults) -> tuple[Table, ...]:
             results,
             "seeding_episodes",
             "Seeding table: episodes until convergence",
-            f"{_HERE} {_EPISODES}",
+            f"{_INTERVAL} {_EPISODES}",
             seeding,
             (EPISODES,),
             marks,

@@ -20,20 +20,18 @@ def seeds_table(results: StudyResults) -> Table:
         runs = results.of(row.key)
         if row.seeding == "none" or not runs or not runs[0].seeding:
             continue
-        run, fate = runs[0], (NONE, NONE)
+        run, fate = runs[0], ("never", "never")
         if row.replay == "fifo":
             from_episode, gone = overwritten(run)
             fate = (episodes_text(from_episode), episodes_text(gone))
             facts.setdefault(_at_this_budget(run, from_episode, gone))
-        else:
-            fate = ("never", "never")
-        for place, (expert, part) in enumerate(run.seeding.items()):
+        for expert, part in run.seeding.items():
             available = int(part["available"])
             bags, rest = divmod(available, _transitions(run))
             rows.append(
                 (
-                    row_name(row.key) if place == 0 else "",
-                    soc_min_text(row.soc_min) if place == 0 else "",
+                    row_name(row.key),
+                    soc_min_text(row.soc_min),
                     _EXPERTS.get(expert, expert),
                     NONE if rest else str(bags),
                     f"{available:,}",
@@ -111,4 +109,7 @@ def _at_this_budget(run: Run, from_episode: int, gone: int) -> str:
             f"; of the paper's {episodes_text(paper)} episodes the same replay would hold some "
             f"for {percent_text(min(gone / paper, 1.0))}"
         )
-    return text + ". A short budget favours seeding: what it shows here need not show there."
+    return text + (
+        ". A budget this short gives the seeds more weight than the paper's: what they do here "
+        "they need not do there."
+    )

@@ -76,11 +76,12 @@ def to_json(table: Table) -> dict[str, Any]:
 def _numbers(cells: Sequence[str]) -> bool:
     """Numbers are read down a column, so they are aligned to the right; text is not."""
     filled = [cell for cell in cells if cell not in ("-", "", "not run", "never")]
-    return 2 * sum(bool(_NUMBER.match(cell)) for cell in filled) > len(filled)
+    found = sum(bool(_NUMBER.match(cell)) for cell in filled)
+    return bool(filled) and 4 * found >= 3 * len(filled)
 
 
 _NUMBER = re.compile(
-    r"(more than )?[+\->]?\s?\d[\d,.]*(-\d[\d,.]*)?( (%|points|kWh|h|s))?( ?[\[(]|,|$)"
+    r"(more than )?[+\->]?\s?\d[\d,.]*(-\d[\d,.]*)?( (%|points|kWh|h|s))?( ?[\[(]|, \d+ of |$)"
 )
 """A number, with a unit, an interval or a remark after it; neither a mark like "(1)", nor a hash,
 a list of numbers or a sentence that begins with one."""
