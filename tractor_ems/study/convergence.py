@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from tractor_ems.study.paper_values import episodes_text
 from tractor_ems.study.statistics import (
@@ -282,9 +283,14 @@ def _held(
 def running_median(values: FloatArray, width: int = LEAST_EVALUATIONS) -> FloatArray:
     """Centred running median, over what there is of the window at both ends, shape (K,)."""
     half = width // 2
-    return np.array(
-        [np.median(values[max(i - half, 0) : i + half + 1]) for i in range(len(values))]
-    )
+    count = len(values)
+    found = np.empty(count)
+    if count >= width:
+        found[half : count - half] = np.median(sliding_window_view(values, width), axis=-1)
+    for i in range(count):
+        if count < width or not half <= i < count - half:
+            found[i] = np.median(values[max(i - half, 0) : i + half + 1])
+    return found
 
 
 def _share(share: float, count: int) -> int:
