@@ -159,6 +159,7 @@ def _provenance(config: StudyConfig, out: Path) -> dict[str, Any]:
         "seeds": list(range(config.budget.seeds)),
         "powertrain_hash": powertrain_hash(plant(config, config.rows[0].soc_min)),
         "cycle_hash": cycle_hash(load_cycle(config.cycle)),
+        "epsilon_decay_share": config.networks.epsilon_decay_share,
         "algorithm_version": ALGORITHM,
         "source_hash": _source_hash(),
         "sittings": len(sittings),
