@@ -50,14 +50,14 @@ def stop_after(pieces: int):
 @pytest.mark.parametrize(
     "row",
     [
-        "ddqn_shaped",
-        "dqn",
-        "ddqn_soft_target",
-        "ddqn_shaped_dp",
+        pytest.param("ddqn_shaped", marks=pytest.mark.slow),
+        pytest.param("dqn", marks=pytest.mark.slow),
+        pytest.param("ddqn_soft_target", marks=pytest.mark.slow),
+        pytest.param("ddqn_shaped_dp", marks=pytest.mark.slow),
         "ddqn_shaped_dp_margin",
-        "q",
+        pytest.param("q", marks=pytest.mark.slow),
         "double_q",
-        "double_q_interpolated",
+        pytest.param("double_q_interpolated", marks=pytest.mark.slow),
     ],
 )
 def test_a_stopped_and_resumed_run_gives_the_same_bytes(row: str, tmp_path: Path) -> None:

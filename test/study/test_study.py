@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 from study.tiny import tiny
 
-from tractor_ems.study.study import collect, run_study
+from tractor_ems.study.config import load_study
+from tractor_ems.study.study import all_tasks, collect, run_study
 from tractor_msgs_py.errors import ConfigError
 
 
@@ -58,6 +59,19 @@ def test_more_seeds_train_only_the_new_ones(
 
     assert len(run_study(more, tmp_path, workers=1, stage=stage).runs) == 2
     assert heard == [0, 1]
+
+
+def test_ablations_may_have_fewer_seeds_and_are_run_last_seed_by_seed(tmp_path: Path) -> None:
+    config = load_study("paper", "standard")
+    config = replace(config, budget=replace(config.budget, ablation_seeds=3))
+    tasks = all_tasks(config, tmp_path)
+    roles = [task.row.role for task in tasks if not task.row.tabular]
+    assert roles == sorted(roles, reverse=True), "what the paper reports comes first"
+    ablations = [task for task in tasks if task.row.role == "ablation"]
+    assert {task.seed for task in ablations} == {0, 1, 2}
+    networks = [task.seed for task in ablations if not task.row.tabular]
+    assert networks == sorted(networks)
+    assert {task.seed for task in tasks if task.row.role == "paper"} == set(range(5))
 
 
 def test_a_missing_run_is_refused_by_name(tmp_path: Path) -> None:

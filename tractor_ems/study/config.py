@@ -79,6 +79,7 @@ class Budget:
 
     Attributes:
         seeds: runs per row, seeds 0, 1, ...
+        ablation_seeds: runs of a row that asks a question of ours; None: as many.
         network_episodes, table_episodes: training episodes per run.
         steps_per_update: environment steps per gradient step of a network.
         network_eval_every, table_eval_every: episodes between greedy evaluations.
@@ -92,6 +93,12 @@ class Budget:
     table_episodes: Count
     table_eval_every: Count
     replay_capacity: Count | None = None
+    ablation_seeds: Annotated[int, Field(ge=1, le=100)] | None = None
+
+    def seeds_of(self, row: Row) -> range:
+        """Seeds of a row's runs."""
+        own = self.ablation_seeds if row.role == "ablation" else None
+        return range(own or self.seeds)
 
 
 @dataclass(frozen=True, config=_STRICT)

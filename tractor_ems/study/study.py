@@ -66,13 +66,19 @@ def run_study(config: StudyConfig, out: Path, *, workers: int, stage: Stage) -> 
 
 
 def all_tasks(config: StudyConfig, out: Path) -> list[Task]:
-    """Every run of the study, the long ones first, so that no core waits for a late one."""
+    """Every run of the study, long ones first, so that no core waits for a late one; ablations
+    last, seed by seed, so that an interrupted study has the same number of all of them."""
     found = []
     for row in config.rows:
-        for seed in range(config.budget.seeds):
+        for seed in config.budget.seeds_of(row):
             folder = run_folder(out, row, seed, config_hash(config, row, seed))
             found.append(Task(config, row, seed, folder, out / "bags"))
-    return sorted(found, key=lambda task: not task.row.tabular)
+    return sorted(found, key=_order)
+
+
+def _order(task: Task) -> tuple[bool, bool, int]:
+    ablation = task.row.role == "ablation"
+    return not task.row.tabular, ablation, task.seed if ablation else 0
 
 
 def collect(config: StudyConfig, out: Path) -> StudyResults:
@@ -83,7 +89,7 @@ def collect(config: StudyConfig, out: Path) -> StudyResults:
     """
     runs = []
     for row in config.rows:
-        for seed in range(config.budget.seeds):
+        for seed in config.budget.seeds_of(row):
             digest = config_hash(config, row, seed)
             runs.append(load_run(run_folder(out, row, seed, digest), row, digest))
     plants = {
