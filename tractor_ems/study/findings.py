@@ -159,7 +159,7 @@ def soc_min_paragraph(results: StudyResults) -> str:
             f"from the bound if SOC_min is {soc_min_text(shaped)}, for any agent near that "
             f"optimum, and says nothing about charge that an agent learned to hold. The unshaped "
             f"row at {percent_text(plain)} needs a SOC_min of {soc_min_text(plain)} or less, at "
-            "which the optimum of the shaped reward ends there too: no single bound gives both."
+            "which the shaped reward's optimum ends there too: no single bound gives both rows."
         )
     else:
         text += (
