@@ -17,6 +17,7 @@ from tractor_ems.study.store import is_done
 from tractor_ems.study.study import all_tasks
 
 SCRIPT = """
+import signal
 import sys
 from pathlib import Path
 from study.tiny import tiny
@@ -25,6 +26,7 @@ from tractor_ems.study.study import all_tasks
 from tractor_msgs_py.errors import RunAborted
 
 def main():
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job has it ignored
     config = tiny("ddqn_shaped", episodes=100_000, seeds=2, actions=65)
     def progress(done, shares):
         if min(shares) > 0:
