@@ -26,6 +26,8 @@ class DutyCycle:
         split: what the cycle may be used for; None for a user's own.
         seed: generator seed; None where there is none.
         source: where it comes from, for a reader.
+        area_ha: field area worked over the whole cycle [ha]; None where it is not field work or
+            width and speed are unknown. Not part of the hash.
     """
 
     name: str
@@ -35,6 +37,7 @@ class DutyCycle:
     split: Split | None = None
     seed: int | None = None
     source: str = ""
+    area_ha: float | None = None
 
     def __post_init__(self) -> None:
         demand = self.power_demand_w
@@ -48,13 +51,15 @@ class DutyCycle:
             )
         if not (np.isfinite(self.dt_s) and 0 < self.dt_s <= 60):
             raise CycleError(f"cycle {self.name}: dt_s {self.dt_s}, allowed 0 < dt_s <= 60")
+        if self.area_ha is not None and not (np.isfinite(self.area_ha) and self.area_ha >= 0):
+            raise CycleError(f"cycle {self.name}: area_ha {self.area_ha}, allowed finite and >= 0")
 
     def __len__(self) -> int:
         return len(self.power_demand_w)
 
 
 def cycle_hash(cycle: DutyCycle) -> str:
-    """SHA-256 of step length and demand; the name does not count."""
+    """SHA-256 of step length and demand; name, source and area do not count."""
     digest = hashlib.sha256()
     digest.update(np.float64(cycle.dt_s).astype("<f8").tobytes())
     digest.update((cycle.power_demand_w + 0.0).astype("<f8").tobytes())
