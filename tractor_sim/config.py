@@ -1,15 +1,20 @@
-"""Powertrain YAML to parameters, and the hash that names a powertrain.
+"""Powertrain YAML to parameters.
 
 The schema refuses unknown keys; ranges are checked where the parameters are built, so a policy
 file's embedded powertrain passes the same checks.
 """
 
+import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from tractor_msgs_py.errors import ConfigError
+from tractor_sim.fuel_curve import convex_fuel_curve
+from tractor_sim.generator import GeneratorParams
 from tractor_sim.powertrain import PowertrainParams
 from tractor_sim.powertrain_json import params_from_json
 from tractor_sim.resources import resource_path
@@ -27,16 +32,48 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+class _FuelCurve(_Strict):
+    """Fuel rate while on at crankshaft powers, as measured or mapped."""
+
+    power_w: Annotated[tuple[NotNegative, ...], Field(min_length=2)]
+    fuel_kg_per_s: Annotated[tuple[NotNegative, ...], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def _pairs(self) -> "_FuelCurve":
+        if len(self.power_w) != len(self.fuel_kg_per_s):
+            raise ValueError(f"{len(self.power_w)} powers, {len(self.fuel_kg_per_s)} fuel rates")
+        if not np.all(np.diff(self.power_w) > 0):
+            raise ValueError("power_w must increase")
+        return self
+
+
 class _Engine(_Strict):
+    """Either an efficiency curve, or fuel curves of which ``curve`` names the one in use."""
+
     power_max_w: Positive
     fuel_lhv_j_per_kg: Positive
-    curve_power_w: tuple[NotNegative, ...]
-    curve_efficiency: tuple[Fraction, ...]
+    curve_power_w: tuple[NotNegative, ...] = ()
+    curve_efficiency: tuple[Fraction, ...] = ()
+    curve: str = ""
+    curves: dict[str, _FuelCurve] = {}
     idle_fuel_kg_per_s: NotNegative = 0.0
     start_fuel_kg: NotNegative = 0.0
     min_on_s: NotNegative = 0.0
     min_off_s: NotNegative = 0.0
     ramp_w_per_s: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> "_Engine":
+        if bool(self.curves) == bool(self.curve_power_w):
+            raise ValueError("give either curve_power_w with curve_efficiency, or curves")
+        if self.curves and self.curve not in self.curves:
+            raise ValueError(f"curve is {self.curve!r}, curves has {', '.join(self.curves)}")
+        if self.curves and self.curves[self.curve].power_w[-1] != self.power_max_w:
+            raise ValueError(
+                f"curves.{self.curve}.power_w ends at {self.curves[self.curve].power_w[-1]}, "
+                f"power_max_w is {self.power_max_w}"
+            )
+        return self
 
 
 class _Generator(_Strict):
@@ -50,6 +87,11 @@ class _Battery(_Strict):
     power_max_w: Positive
     soc_min: Fraction
     soc_max: Fraction
+    ocv_soc: tuple[Fraction, ...] = ()
+    ocv_v: tuple[Positive, ...] = ()
+    resistance_ohm: NotNegative = 0.0
+    current_max_charge_a: Positive | None = None
+    current_max_discharge_a: Positive | None = None
 
 
 class _Powertrain(_Strict):
@@ -66,19 +108,74 @@ class _Powertrain(_Strict):
 def load_powertrain(name_or_path: str | Path) -> PowertrainParams:
     """A powertrain by name (``config/powertrain/NAME.yaml``) or by YAML file.
 
+    Settings may be changed behind a colon, by their dotted names in the file:
+    ``field:engine.start_fuel_kg=0.06,engine.curve=fixed_1800_rpm``. The powertrain is then
+    called so.
+
     Raises:
         ConfigError: the file is missing, is not YAML, has an unknown key, or a value out of
             range; the message names the file, the field, the value and the allowed range.
     """
-    path = _find(name_or_path)
+    text = str(name_or_path)
+    found, document = read_powertrain(text)
     try:
-        checked = _Powertrain.model_validate(read_yaml(path))
+        checked = _Powertrain.model_validate(document)
     except ValidationError as error:
-        raise ConfigError(f"{path}: {describe(error)}") from None
+        raise ConfigError(f"{found}: {describe(error)}") from None
     try:
-        return params_from_json(checked.model_dump(mode="json"))
+        params = params_from_json(_resolved(checked.model_dump(mode="json")))
     except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from None
+        raise ConfigError(f"{found}: {error}") from None
+    settings = text.partition(":")[2] if ":" in text and not Path(text).is_file() else ""
+    return dataclasses.replace(params, name=f"{params.name}:{settings}") if settings else params
+
+
+def read_powertrain(name_or_path: str) -> tuple[str, Any]:
+    """The raw document behind a name or file with its changed settings, and how errors name it.
+
+    Raises:
+        ConfigError: the file is missing or not YAML, or a setting is malformed.
+    """
+    base, _, settings = name_or_path.partition(":")
+    if Path(name_or_path).is_file():
+        base, settings = name_or_path, ""
+    path = _find(base)
+    document = read_yaml(path)
+    if not settings:
+        return str(path), document
+    for setting in settings.split(","):
+        dotted, equals, value = setting.partition("=")
+        *parents, last = dotted.split(".")
+        place = document
+        for parent in parents:
+            place = place.get(parent) if isinstance(place, dict) else None
+        if not (equals and last and isinstance(place, dict)):
+            raise ConfigError(
+                f"powertrain {name_or_path!r}: {setting!r} is no setting of {path}, "
+                "write for instance engine.start_fuel_kg=0.06"
+            )
+        try:
+            place[last] = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise ConfigError(f"powertrain {name_or_path!r}: {value!r} is no value") from None
+    return f"{path}:{settings}", document
+
+
+def _resolved(document: dict[str, Any]) -> dict[str, Any]:
+    """The checked document in the terms of the parameters: the fuel curve in use, made convex."""
+    engine = document["engine"]
+    name, curves = engine.pop("curve"), engine.pop("curves")
+    if curves:
+        generator = GeneratorParams(**{k: tuple(v) for k, v in document["generator"].items()})
+        knots_w, fuel_kg_per_s = convex_fuel_curve(
+            generator,
+            np.array(curves[name]["power_w"]),
+            np.array(curves[name]["fuel_kg_per_s"]),
+            engine["idle_fuel_kg_per_s"],
+        )
+        engine["curve_power_w"] = knots_w.tolist()
+        engine["curve_fuel_kg_per_s"] = fuel_kg_per_s.tolist()
+    return document
 
 
 def describe(error: ValidationError) -> str:

@@ -1,6 +1,7 @@
 """Engine: fuel against power, and the start and ramp logic around it.
 
-The efficiency curve is piecewise linear over power at the crankshaft; off burns nothing.
+Either the efficiency or the fuel rate is piecewise linear over power at the crankshaft; off burns
+nothing.
 """
 
 from dataclasses import dataclass
@@ -17,13 +18,15 @@ class EngineParams:
 
     Attributes:
         power_max_w: largest crankshaft power [W].
-        curve_power_w: knots of the efficiency curve, increasing from 0 to power_max_w [W].
-        curve_efficiency: efficiency at the knots, 0 < value < 1.
+        curve_power_w: knots of the curve, increasing from 0 to power_max_w [W].
+        curve_efficiency: efficiency at the knots, 0 < value < 1; empty with a fuel curve.
         fuel_lhv_j_per_kg: lower heating value [J/kg].
         idle_fuel_kg_per_s: least fuel rate while on [kg/s].
         start_fuel_kg: fuel of one start [kg].
         min_on_s, min_off_s: least time in a state before it may be left [s].
         ramp_w_per_s: largest change of power while on, inf for none [W/s].
+        curve_fuel_kg_per_s: fuel rate while on at the knots, increasing; its first value, at
+            power 0, is what the engine burns idling [kg/s]. Empty with an efficiency curve.
     """
 
     power_max_w: float
@@ -35,6 +38,7 @@ class EngineParams:
     min_on_s: float = 0.0
     min_off_s: float = 0.0
     ramp_w_per_s: float = float("inf")
+    curve_fuel_kg_per_s: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("power_max_w", "fuel_lhv_j_per_kg"):
@@ -47,10 +51,17 @@ class EngineParams:
                 raise ConfigError(f"engine.{name}: {value}, allowed finite and >= 0")
         if not self.ramp_w_per_s > 0:
             raise ConfigError(f"engine.ramp_w_per_s: {self.ramp_w_per_s}, allowed > 0")
-        power, efficiency = np.array(self.curve_power_w), np.array(self.curve_efficiency)
-        if len(power) < 2 or len(power) != len(efficiency):
+        self._check_curve()
+
+    def _check_curve(self) -> None:
+        power, fuel = np.array(self.curve_power_w), np.array(self.curve_fuel_kg_per_s)
+        eta = np.array(self.curve_efficiency)
+        name, values = ("fuel rates", fuel) if len(fuel) else ("efficiencies", eta)
+        if len(fuel) and len(eta):
+            raise ConfigError("engine.curve_efficiency, curve_fuel_kg_per_s: only one is allowed")
+        if len(power) < 2 or len(power) != len(values):
             raise ConfigError(
-                f"engine.curve_power_w: {len(power)} powers, {len(efficiency)} efficiencies, "
+                f"engine.curve_power_w: {len(power)} powers, {len(values)} {name}, "
                 "at least 2 of each in equal number"
             )
         if power[0] != 0.0 or not np.all(np.diff(power) > 0):
@@ -59,29 +70,47 @@ class EngineParams:
             raise ConfigError(
                 f"engine.curve_power_w: ends at {power[-1]} W, power_max_w is {self.power_max_w}"
             )
-        if not np.all((efficiency > 0) & (efficiency < 1)):
-            raise ConfigError("engine.curve_efficiency: every value must lie in 0 < value < 1")
+        if not len(fuel):
+            if not np.all((eta > 0) & (eta < 1)):
+                raise ConfigError("engine.curve_efficiency: every value must lie in 0 < value < 1")
+            return
+        least = power / self.fuel_lhv_j_per_kg
+        if not (np.all(np.diff(fuel) > 0) and fuel[0] >= 0 and np.all(fuel[1:] > least[1:])):
+            raise ConfigError(
+                "engine.curve_fuel_kg_per_s: must increase from >= 0 and be more than "
+                "power / fuel_lhv_j_per_kg (an efficiency below 1)"
+            )
 
 
 def efficiency(params: EngineParams, power_w: FloatArray) -> FloatArray:
-    """Crankshaft efficiency at ``power_w`` (any shape), clamped to the curve's ends."""
-    return np.interp(power_w, params.curve_power_w, params.curve_efficiency)
+    """Crankshaft efficiency at ``power_w`` (any shape) while on, clamped to the curve's ends."""
+    if not params.curve_fuel_kg_per_s:
+        return np.interp(power_w, params.curve_power_w, params.curve_efficiency)
+    power = np.clip(power_w, 0.0, params.power_max_w)
+    burning = np.interp(power, params.curve_power_w, params.curve_fuel_kg_per_s)
+    eta: FloatArray = power / np.where(power > 0.0, burning * params.fuel_lhv_j_per_kg, 1.0)
+    return eta
 
 
 def fuel_rate_kg_per_s(
     params: EngineParams, power_w: FloatArray, engine_on: BoolArray | None = None
 ) -> FloatArray:
-    """Fuel rate [kg/s]: P / (eta(P) * LHV), at least the idle rate; an engine that is off burns
-    nothing. ``engine_on`` defaults to ``power_w > 0`` (an idling engine is on at power 0)."""
+    """Fuel rate [kg/s]: the fuel curve or P / (eta(P) * LHV), at least the idle rate; an engine
+    that is off burns nothing. ``engine_on`` defaults to ``power_w > 0`` (an idling engine is on
+    at power 0)."""
     power = np.asarray(power_w, dtype=np.float64)
     on = power > 0.0 if engine_on is None else engine_on
-    burning = power / (efficiency(params, power) * params.fuel_lhv_j_per_kg)
+    if params.curve_fuel_kg_per_s:
+        burning = np.interp(power, params.curve_power_w, params.curve_fuel_kg_per_s)
+    else:
+        burning = power / (efficiency(params, power) * params.fuel_lhv_j_per_kg)
     return np.where(on, np.maximum(burning, params.idle_fuel_kg_per_s), 0.0)
 
 
 def best_power_w(params: EngineParams) -> float:
-    """Power of best efficiency [W]; a knot, because the curve is piecewise linear."""
-    return float(params.curve_power_w[int(np.argmax(params.curve_efficiency))])
+    """Power of best efficiency [W]: a knot, because either curve is piecewise linear."""
+    knots_w = np.array(params.curve_power_w)
+    return float(knots_w[int(np.argmax(efficiency(params, knots_w)))])
 
 
 def power_range_w(

@@ -1,4 +1,8 @@
-"""Generator and rectifier: crankshaft power to bus power and back."""
+"""Generator and rectifier: crankshaft power to bus power and back.
+
+Bus power is piecewise linear over crankshaft power, so a fuel curve that is piecewise linear over
+one is so over the other.
+"""
 
 from dataclasses import dataclass
 
@@ -10,7 +14,7 @@ from tractor_msgs_py.trajectory import FloatArray
 
 @dataclass(frozen=True)
 class GeneratorParams:
-    """Efficiency over load fraction, piecewise linear; a single 1.0 is an ideal generator.
+    """Efficiency at load fractions; a single 1.0 is an ideal generator.
 
     Attributes:
         load_fraction: knots, increasing from 0 to 1 (crankshaft power over engine maximum).
@@ -32,6 +36,10 @@ class GeneratorParams:
             )
         if not np.all((values > 0) & (values <= 1)):
             raise ConfigError("generator.curve_efficiency: every value must lie in 0 < value <= 1")
+        if np.any(np.diff(load * values) <= 0):
+            raise ConfigError(
+                "generator.curve_efficiency: bus power must increase with crankshaft power"
+            )
 
     @property
     def ideal(self) -> bool:
@@ -39,16 +47,10 @@ class GeneratorParams:
         return all(value == 1.0 for value in self.curve_efficiency)
 
 
-_GRID = 4097
-
-
-def _table(params: GeneratorParams, engine_power_max_w: float) -> tuple[FloatArray, FloatArray]:
-    crank = np.linspace(0.0, engine_power_max_w, _GRID)
-    eta = np.interp(crank / engine_power_max_w, params.load_fraction, params.curve_efficiency)
-    bus = crank * eta
-    if np.any(np.diff(bus) <= 0):
-        raise ConfigError("generator: bus power does not increase with crankshaft power")
-    return crank, bus
+def knots_w(params: GeneratorParams, engine_power_max_w: float) -> tuple[FloatArray, FloatArray]:
+    """Knots as crankshaft power and bus power, both increasing from 0 [W]."""
+    crank_w = np.array(params.load_fraction) * engine_power_max_w
+    return crank_w, crank_w * np.array(params.curve_efficiency)
 
 
 def to_bus_w(
@@ -57,7 +59,7 @@ def to_bus_w(
     """Bus power of a crankshaft power [W], any shape."""
     if params.ideal:
         return np.asarray(crank_w, dtype=np.float64)
-    crank, bus = _table(params, engine_power_max_w)
+    crank, bus = knots_w(params, engine_power_max_w)
     return np.interp(crank_w, crank, bus)
 
 
@@ -67,5 +69,5 @@ def to_crank_w(
     """Crankshaft power that gives a bus power [W], the inverse of :func:`to_bus_w`."""
     if params.ideal:
         return np.asarray(bus_w, dtype=np.float64)
-    crank, bus = _table(params, engine_power_max_w)
+    crank, bus = knots_w(params, engine_power_max_w)
     return np.interp(bus_w, bus, crank)

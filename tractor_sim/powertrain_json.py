@@ -16,12 +16,36 @@ from tractor_sim.engine import EngineParams
 from tractor_sim.generator import GeneratorParams
 from tractor_sim.powertrain import PowertrainParams
 
+_LATER: dict[str, dict[str, Any]] = {
+    "engine": {"curve_fuel_kg_per_s": ()},
+    "battery": {
+        "ocv_soc": (),
+        "ocv_v": (),
+        "resistance_ohm": 0.0,
+        "current_max_charge_a": math.inf,
+        "current_max_discharge_a": math.inf,
+    },
+}
+"""Fields that the first version did not have, with what it meant: left out where they hold that,
+so that a powertrain keeps its hash, and recorded bags and trained policies their powertrain."""
+
+_UNLIMITED = {
+    "engine": ("ramp_w_per_s",),
+    "battery": ("current_max_charge_a", "current_max_discharge_a"),
+}
+
 
 def params_to_json(params: PowertrainParams) -> dict[str, Any]:
-    """Plain data; an absent ramp limit is null, because JSON has no infinity."""
+    """Plain data; an absent limit is null, because JSON has no infinity."""
     data = dataclasses.asdict(params)
-    if math.isinf(params.engine.ramp_w_per_s):
-        data["engine"]["ramp_w_per_s"] = None
+    for part, fields in _LATER.items():
+        for field, meaning in fields.items():
+            if data[part][field] == meaning:
+                del data[part][field]
+    for part, names in _UNLIMITED.items():
+        for name in names:
+            if data[part].get(name) == math.inf:
+                data[part][name] = None
     return data
 
 
@@ -32,12 +56,10 @@ def params_from_json(data: dict[str, Any]) -> PowertrainParams:
         ConfigError: a field is missing, unknown, mistyped or out of range.
     """
     try:
-        engine = dict(data["engine"])
-        if engine.get("ramp_w_per_s") is None:
-            engine["ramp_w_per_s"] = math.inf
-        engine = {key: _number(value) for key, value in engine.items()}
-        generator = {key: _number(value) for key, value in data["generator"].items()}
-        battery = {key: _number(value) for key, value in data["battery"].items()}
+        engine, generator, battery = (
+            {key: _number(value) for key, value in data[part].items()}
+            for part in ("engine", "generator", "battery")
+        )
         target = data.get("soc_target")
         return PowertrainParams(
             name=str(data["name"]),
@@ -54,6 +76,8 @@ def params_from_json(data: dict[str, Any]) -> PowertrainParams:
 
 
 def _number(value: Any) -> Any:
+    if value is None:
+        return math.inf
     if isinstance(value, list | tuple):
         return tuple(float(item) for item in value)
     return float(value)

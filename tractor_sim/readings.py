@@ -5,20 +5,22 @@ import numpy as np
 from tractor_msgs_py.codec import wire_soc
 from tractor_msgs_py.trajectory import FloatArray
 from tractor_msgs_py.types import BatteryReading, PowertrainReading
-from tractor_sim.battery import current_a
+from tractor_sim.battery import current_a, terminal_v
 from tractor_sim.powertrain import PlantState, PowertrainParams, StepResult, power_limits
 
 
 def battery_reading(
     params: PowertrainParams, state: PlantState, last: StepResult | None, stamp_ns: int
 ) -> BatteryReading:
-    """Battery state of the first plant of the batch; the current is that of the last step."""
+    """Battery state of the first plant of the batch; voltage and current are those of the last
+    step's power at the present SOC."""
     power_w = np.zeros(1) if last is None else last.battery_power_w[:1]
+    battery, soc = params.battery, state.soc[:1]
     return BatteryReading(
         stamp_ns,
         float(wire_soc(state.soc[0])),
-        params.battery.voltage_v,
-        float(current_a(params.battery, power_w)[0]),
+        float(terminal_v(battery, soc, power_w)[0]),
+        float(current_a(battery, soc, power_w)[0]),
     )
 
 
