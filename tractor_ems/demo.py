@@ -17,7 +17,8 @@ from tractor_ems.scenario import Scenario, make_scenario
 from tractor_msgs_py.atomic import write_bytes, write_json
 from tractor_msgs_py.errors import ConfigError
 from tractor_msgs_py.trajectory import Trajectory
-from tractor_sim.duty_cycle.library import cycle_names
+from tractor_sim.duty_cycle.cycle import Split
+from tractor_sim.duty_cycle.library import listed_cycles
 
 SUMMARY_SCHEMA = 1
 BASELINES = ("dp", "rule_based", "best_point", "myopic_greedy", "conventional")
@@ -26,6 +27,11 @@ MARKER = ".tractor_ems_demo"
 """File that says a folder is a demo's; only such a folder is cleared."""
 
 Say = Callable[[str], None]
+
+
+def _planters(split: Split, count: int) -> tuple[str, ...]:
+    """The first cycles of the paper's operation in a split."""
+    return tuple(row.name for row in listed_cycles(split, "planter")[:count])
 
 
 @dataclass(frozen=True)
@@ -37,15 +43,15 @@ class DemoConfig:
         soc_initial, soc_target: of every run; the paper's pass starts at 0.85 and its DP ends at
             0.836.
         train_cycles: recorded, one DP and one rule-based bag each.
-        held_out_cycles: driven after training.
+        unseen_cycles: driven after training, which never saw them.
         seed: of training.
     """
 
     powertrain: str = "paper"
     soc_initial: float = 0.85
     soc_target: float = 0.836
-    train_cycles: tuple[str, ...] = ("planter", *cycle_names("train")[1:6])
-    held_out_cycles: tuple[str, ...] = tuple(cycle_names("held_out")[:5])
+    train_cycles: tuple[str, ...] = _planters("train", 6)
+    unseen_cycles: tuple[str, ...] = _planters("validation", 5)
     seed: int = 0
 
 
@@ -72,7 +78,7 @@ def run_demo(out: Path, config: DemoConfig, say: Say) -> dict[str, Any]:
     results, runs = _drive(out, config, training, tell)
     for cycle, by_policy in runs.items():
         scenario = _scenario(config, cycle)
-        title = f"held-out cycle {cycle}: learned offline from bags, driven in ROS 2 lockstep"
+        title = f"unseen cycle {cycle}: learned offline from bags, driven in ROS 2 lockstep"
         plot_runs(
             out / "plots" / f"{cycle}.png", title, by_policy, scenario.params, config.soc_target
         )
@@ -145,11 +151,11 @@ def _train(out: Path, config: DemoConfig, bags: list[dict[str, Any]], tell: Say)
 def _drive(
     out: Path, config: DemoConfig, training: dict[str, Any], tell: Say
 ) -> tuple[list[Result], dict[str, dict[str, Trajectory]]]:
-    """Every policy over every held-out cycle: what was learnt through the nodes, the rest
+    """Every policy over every unseen cycle: what was learnt through the nodes, the rest
     in-process, where the trajectory is the same."""
     results: list[Result] = []
     runs: dict[str, dict[str, Trajectory]] = {}
-    for cycle in config.held_out_cycles:
+    for cycle in config.unseen_cycles:
         scenario = _scenario(config, cycle)
         runs[cycle] = {}
         for targets, facts in training.items():

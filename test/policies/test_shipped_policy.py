@@ -9,8 +9,8 @@ from tractor_ems.policies.q_policy import load_policy
 from tractor_ems.policies.registry import policy_file
 from tractor_ems.scenario import make_scenario
 from tractor_sim.config import load_powertrain
-from tractor_sim.duty_cycle.cycle import cycle_hash
-from tractor_sim.duty_cycle.library import cycle_names, load_cycle
+from tractor_sim.duty_cycle.library import cycle_names
+from tractor_sim.duty_cycle.shipped import published_hashes
 from tractor_sim.powertrain_json import powertrain_hash
 
 FILE = policy_file("default", "paper")
@@ -21,16 +21,16 @@ def test_the_card_names_the_file_by_its_hash():
     assert hashlib.sha256(FILE.read_bytes()).hexdigest() in card
 
 
-def test_it_was_made_for_the_shipped_powertrain_without_any_held_out_cycle():
+def test_it_was_made_for_the_shipped_powertrain_from_training_cycles_alone():
     metadata = load_policy(FILE).metadata
     assert metadata["powertrain_hash"] == powertrain_hash(load_powertrain("paper"))
-    held_out = {cycle_hash(load_cycle(name)) for name in cycle_names("held_out")}
+    train = {published_hashes()[name].sha256 for name in cycle_names("train")}
     assert metadata["cycle_hashes"]
-    assert not held_out & set(metadata["cycle_hashes"])
+    assert set(metadata["cycle_hashes"]) <= train
     assert len(metadata["bag_hashes"]) == 24
 
 
-@pytest.mark.parametrize("cycle", cycle_names("held_out")[:5])
+@pytest.mark.parametrize("cycle", [f"planter_{seed}" for seed in range(1001, 1006)])
 def test_it_keeps_its_cards_promise_and_beats_the_rule_base(cycle):
     scenario = make_scenario("paper", cycle, 0.85, 0.836)
     ours, rule_base = (evaluate(name, scenario)[0] for name in ("default", "rule_based"))

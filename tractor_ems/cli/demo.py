@@ -28,7 +28,7 @@ def demo(
 
 
 def _print_summary(results: list[dict[str, Any]]) -> None:
-    """One row per policy over all held-out cycles, the best median dp_ratio first."""
+    """One row per policy over all unseen cycles, the best median dp_ratio first."""
     by_policy: dict[str, list[dict[str, Any]]] = {}
     for result in results:
         by_policy.setdefault(result["policy"], []).append(result)
@@ -52,7 +52,7 @@ def _print_summary(results: list[dict[str, Any]]) -> None:
     cycles = len({run["cycle"] for run in results})
     columns = ("policy", "dp_ratio", "worst", "gal", "SOC gap", "starts", "violations")
     print_table(
-        f"{cycles} held-out cycles: median and worst dp_ratio, mean fuel, worst SOC gap "
+        f"{cycles} unseen cycles: median and worst dp_ratio, mean fuel, worst SOC gap "
         "to the target in points",
         columns,
         rows,

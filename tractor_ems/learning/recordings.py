@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +9,7 @@ import numpy as np
 from tractor_ems.bags.transitions import Trace, iter_traces
 from tractor_msgs_py.errors import BagError
 from tractor_msgs_py.trajectory import FloatArray
-from tractor_sim.duty_cycle.cycle import cycle_hash
-from tractor_sim.duty_cycle.library import cycle_names, load_cycle
+from tractor_sim.duty_cycle.shipped import held_out_name
 from tractor_sim.powertrain import PowertrainParams
 from tractor_sim.powertrain_json import powertrain_hash
 
@@ -81,11 +79,8 @@ def read_recordings(
     rule = iter_traces(rule_bags) if rule_bags else []
     for trace in (*given, *rule):
         check_trace(trace, params, allow_other_powertrain=allow_other_powertrain)
-        if not allow_held_out and trace.cycle_hash in held_out_cycles():
-            raise BagError(
-                f"{trace.bag}: drives {held_out_cycles()[trace.cycle_hash]}, a held-out cycle "
-                "that training must not see (unless allow_held_out says so)"
-            )
+        if not allow_held_out:
+            _refuse_held_out(trace)
     return Recordings(
         dp=_in_order(trace for trace in given if trace.policy in EXPERT),
         rule=_in_order((*(trace for trace in given if trace.policy not in EXPERT), *rule)),
@@ -96,10 +91,13 @@ def _in_order(traces: Iterable[Trace]) -> tuple[Trace, ...]:
     return tuple(sorted(traces, key=lambda t: (t.bag_hash, t.run_id, int(t.stamp_ns[0]))))
 
 
-@lru_cache(maxsize=1)
-def held_out_cycles() -> dict[str, str]:
-    """Names of the shipped held-out cycles by their SHA-256."""
-    return {cycle_hash(load_cycle(name)): name for name in cycle_names("held_out")}
+def _refuse_held_out(trace: Trace) -> None:
+    name = held_out_name(trace.power_demand_w, trace.dt_s, trace.cycle_hash, trace.cycle)
+    if name is not None:
+        raise BagError(
+            f"{trace.bag}: drives {name}, a held-out cycle that training must not see "
+            "(unless allow_held_out says so)"
+        )
 
 
 def check_trace(trace: Trace, params: PowertrainParams, *, allow_other_powertrain: bool) -> None:
