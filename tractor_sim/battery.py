@@ -124,8 +124,10 @@ def discharge_current_a(params: BatteryParams, soc: FloatArray, power_w: FloatAr
     The smaller root of P = (OCV - R I) I, in the form that does not cancel; power above
     OCV^2 / 4R, which no current gives, counts as that.
     """
-    ocv_v = open_circuit_v(params, soc)
-    root_v = np.sqrt(np.maximum(ocv_v**2 - 4.0 * params.resistance_ohm * power_w, 0.0))
+    ocv_v, ohm = open_circuit_v(params, soc), params.resistance_ohm
+    if ohm > 0.0:
+        power_w = np.minimum(power_w, ocv_v**2 / (4.0 * ohm))
+    root_v = np.sqrt(np.maximum(ocv_v**2 - 4.0 * ohm * power_w, 0.0))
     current: FloatArray = 2.0 * power_w / (ocv_v + root_v)
     return current
 

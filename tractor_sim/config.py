@@ -126,7 +126,7 @@ def load_powertrain(name_or_path: str | Path) -> PowertrainParams:
         params = params_from_json(_resolved(checked.model_dump(mode="json")))
     except ConfigError as error:
         raise ConfigError(f"{found}: {error}") from None
-    settings = text.partition(":")[2] if ":" in text and not Path(text).is_file() else ""
+    settings = "" if _is_file(text) else text.partition(":")[2]
     return dataclasses.replace(params, name=f"{params.name}:{settings}") if settings else params
 
 
@@ -137,7 +137,7 @@ def read_powertrain(name_or_path: str) -> tuple[str, Any]:
         ConfigError: the file is missing or not YAML, or a setting is malformed.
     """
     base, _, settings = name_or_path.partition(":")
-    if Path(name_or_path).is_file():
+    if _is_file(name_or_path):
         base, settings = name_or_path, ""
     path = _find(base)
     document = read_yaml(path)
@@ -156,8 +156,10 @@ def read_powertrain(name_or_path: str) -> tuple[str, Any]:
             )
         try:
             place[last] = yaml.safe_load(value)
-        except yaml.YAMLError:
-            raise ConfigError(f"powertrain {name_or_path!r}: {value!r} is no value") from None
+        except (yaml.YAMLError, ValueError, RecursionError):  # ValueError: a date 2023-13-01
+            raise ConfigError(
+                f"powertrain {_shown(name_or_path)}: {_shown(value)} is no value of {dotted}"
+            ) from None
     return f"{path}:{settings}", document
 
 
@@ -195,16 +197,23 @@ def _shown(value: object) -> str:
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
 
 
+def _is_file(text: str) -> bool:
+    try:
+        return Path(text).is_file()
+    except OSError:  # many settings are longer than a file name may be
+        return False
+
+
 def _find(name_or_path: str | Path) -> Path:
     text = str(name_or_path)
     if text.endswith((".yaml", ".yml")) or "/" in text:
         path = Path(text)
-        if not path.is_file():
+        if not _is_file(text):
             raise ConfigError(f"{path}: no such powertrain file")
         return path
     folder = resource_path("config", "powertrain")
     path = folder / f"{text}.yaml"
-    if not path.is_file():
+    if not _is_file(str(path)):
         known = ", ".join(sorted(item.stem for item in folder.glob("*.yaml")))
         raise ConfigError(f"powertrain {text!r}: unknown, shipped are: {known}")
     return path
