@@ -1,14 +1,18 @@
-"""``ems cycle``: which cycles there are, and what one looks like."""
+"""``ems cycle``: which cycles there are, what one looks like, new ones, and ones of your own."""
 
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any, get_args
 
 import numpy as np
 import typer
 
-from tractor_ems.cli.output import JsonFlag, print_json, print_table
-from tractor_sim.duty_cycle.cycle import DutyCycle, cycle_hash
+from tractor_ems.cli.output import JsonFlag, print_json, print_result, print_table
+from tractor_msgs_py.errors import ConfigError
+from tractor_sim.duty_cycle.cycle import DutyCycle, Split, cycle_hash
 
 app = typer.Typer(help="Duty cycles.", no_args_is_help=True)
+
+Force = Annotated[bool, typer.Option("--force", help="Replace a file that exists.")]
 
 
 def _row(cycle: DutyCycle) -> dict[str, Any]:
@@ -25,11 +29,21 @@ def _row(cycle: DutyCycle) -> dict[str, Any]:
 
 
 @app.command("list")
-def list_cycles(json: JsonFlag = False) -> None:
-    """Shipped cycles with their split."""
-    from tractor_sim.duty_cycle.library import cycle_names, load_cycle
+def list_cycles(
+    split: Annotated[
+        str | None,
+        typer.Option("--set", "--split", help="Only of train, validation or held-out."),
+    ] = None,
+    operation: Annotated[str | None, typer.Option(help="Only of this operation.")] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Listed cycles with their split."""
+    from tractor_sim.duty_cycle.library import listed_cycles, load_cycle
 
-    rows = [_row(load_cycle(name)) for name in cycle_names()]
+    known = list(dict.fromkeys(row.operation for row in listed_cycles()))
+    if operation is not None and operation not in known:
+        raise ConfigError(f"--operation: {operation!r}, allowed {', '.join(known)}")
+    rows = [_row(load_cycle(row.name)) for row in listed_cycles(_split(split), operation)]
     if json:
         print_json({"cycles": rows})
         return
@@ -39,7 +53,7 @@ def list_cycles(json: JsonFlag = False) -> None:
 
 @app.command("show")
 def show(
-    cycle: Annotated[str, typer.Argument(help="Shipped name, CSV file or bag.")],
+    cycle: Annotated[str, typer.Argument(help="Listed name, CSV file or bag.")],
     json: JsonFlag = False,
 ) -> None:
     """One cycle: statistics and hash; with --json its samples too."""
@@ -55,9 +69,95 @@ def show(
         "p05_w": float(quantiles[0]),
         "median_w": float(quantiles[1]),
         "p95_w": float(quantiles[2]),
+        "area_ha": found.area_ha,
         "hash": cycle_hash(found),
     }
     if json:
         print_json(row | {"power_demand_w": demand_w.tolist()})
         return
     print_table(found.name, ("quantity", "value"), list(row.items()))
+
+
+@app.command("generate")
+def generate(
+    operation: Annotated[str, typer.Argument(help="Kind of work, for instance chisel_plow.")],
+    seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same bytes.")],
+    out: Annotated[Path, typer.Option(help="CSV file to write.")],
+    duration_s: Annotated[
+        int | None, typer.Option(min=1, help="Length [s]; default the operation's.")
+    ] = None,
+    depth_cm: Annotated[
+        float | None, typer.Option(help="Working depth of tillage [cm]; default from the seed.")
+    ] = None,
+    force: Force = False,
+    json: JsonFlag = False,
+) -> None:
+    """Write one cycle of an operation, listed or new, as CSV."""
+    from tractor_ems.cycle_import import check_out
+    from tractor_sim.duty_cycle.cycle_csv import write_cycle_csv
+    from tractor_sim.duty_cycle.library import generate_cycle
+    from tractor_sim.duty_cycle.shipped import with_shipped_split
+
+    check_out(out, force)
+    made = generate_cycle(operation, seed, duration_s=duration_s, depth_cm=depth_cm)
+    write_cycle_csv(out, made)
+    area_ha = made.area_ha
+    row = _row(with_shipped_split(made)) | {
+        "area_ha": area_ha,
+        "hash": cycle_hash(made),
+        "file": str(out),
+    }
+    if json:
+        print_json(row)
+        return
+    print_result(row)
+
+
+@app.command("import")
+def import_(
+    source: Annotated[
+        Path, typer.Argument(metavar="FILE", help="CSV with time_s,power_demand_w, or a bag.")
+    ],
+    out: Annotated[Path, typer.Option(help="CSV file to write.")],
+    dt: Annotated[float, typer.Option(help="Step of the cycle [s], 0 < dt <= 60.")] = 1.0,
+    max_gap_s: Annotated[
+        float, typer.Option(help="Longest gap that a straight line fills [s].")
+    ] = 10.0,
+    max_power_w: Annotated[
+        float, typer.Option(help="Larger demand, either way, is dropped [W].")
+    ] = 2e6,
+    max_dropped: Annotated[
+        float, typer.Option(help="Share of rows that may be unusable, 0..1.")
+    ] = 0.1,
+    split_gaps: Annotated[
+        bool, typer.Option("--split-gaps", help="Cut at longer gaps, one file per piece.")
+    ] = False,
+    force: Force = False,
+    json: JsonFlag = False,
+) -> None:
+    """Make a cycle of a recording: even steps, gaps filled, and an account of what was dropped.
+
+    A sample is held until the next and a step is the mean over its time, so energy is kept
+    whether samples are closer than the step or further apart.
+    """
+    from tractor_ems.cycle_import import import_cycle
+    from tractor_sim.duty_cycle.resample import ImportSettings
+
+    settings = ImportSettings(dt, max_gap_s, max_power_w, max_dropped, split_gaps)
+    paths, account = import_cycle(source, out, settings, force=force)
+    document = {"source": str(source), "files": [str(path) for path in paths], "dt_s": dt}
+    document |= account.to_json()
+    if json:
+        print_json(document)
+        return
+    print_result(document)
+
+
+def _split(text: str | None) -> Split | None:
+    if text is None:
+        return None
+    for split in get_args(Split):
+        if text.replace("-", "_") == split:
+            found: Split = split
+            return found
+    raise ConfigError(f"--set: {text!r}, allowed train, validation, held-out")

@@ -1,0 +1,298 @@
+"""A recorded demand at any rate, with holes and slips, to a duty cycle at equal steps.
+
+A sample is held until the next one, as a duty cycle holds its own; a step's demand is the mean
+over the step. So energy is kept whichever way the rate changes, and what had to be dropped or
+filled is counted.
+"""
+
+from bisect import bisect_left
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from tractor_msgs_py.errors import CycleError
+from tractor_msgs_py.trajectory import BoolArray, FloatArray, IntArray
+
+GAP = 1.5
+"""An interval longer than this many usual ones is a gap: at least one sample is missing."""
+
+MAX_STEPS = 10_000_000
+"""Of one imported cycle; more is a wrong clock or a wrong unit of time."""
+
+
+@dataclass(frozen=True)
+class ImportSettings:
+    """How a recording is cleaned.
+
+    Attributes:
+        dt_s: step of the result, 0 < dt_s <= 60 [s].
+        max_gap_s: longest gap that is filled by a straight line [s].
+        max_power_w: larger demand, either way, is absurd and dropped [W].
+        max_dropped: greatest share of rows that may be dropped, 0..1.
+        split: cut at longer gaps instead of refusing them.
+    """
+
+    dt_s: float = 1.0
+    max_gap_s: float = 10.0
+    max_power_w: float = 2e6
+    max_dropped: float = 0.1
+    split: bool = False
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "dt_s": (0 < self.dt_s <= 60, "0 < dt_s <= 60"),
+            "max_gap_s": (0 <= self.max_gap_s <= 3600, "0..3600"),
+            "max_power_w": (0 < self.max_power_w <= 1e9, "above 0, at most 1e9"),
+            "max_dropped": (0 <= self.max_dropped <= 1, "0..1"),
+        }
+        for name, (fits, allowed) in ranges.items():
+            if not fits:  # not so for NaN either
+                raise CycleError(f"{name}: {getattr(self, name)}, allowed {allowed}")
+
+
+@dataclass(frozen=True)
+class Samples:
+    """What a file holds, before any judgement.
+
+    Attributes:
+        source: file or bag, for messages.
+        place: what a row is called in messages and which it is, shape (N,): a line of a CSV file,
+            a message of a bag.
+        time_s: NaN where it is no number, shape (N,) [s].
+        power_demand_w: NaN where it is no number, shape (N,) [W].
+        place_name: "line" or "message".
+        refused: samples that the file's reader refused or dropped, by reason.
+    """
+
+    source: str
+    place: IntArray
+    time_s: FloatArray
+    power_demand_w: FloatArray
+    place_name: str = "line"
+    refused: tuple[tuple[str, int], ...] = ()
+
+
+@dataclass(frozen=True)
+class Account:
+    """What an import did with the rows.
+
+    Attributes:
+        rows_read: all of them.
+        rows_kept: those the result is made of.
+        dropped_not_a_number, dropped_absurd_power, dropped_duplicate_time,
+        dropped_time_backwards: rows left out, each under its first fault.
+        first_dropped: place and fault of the first of them; empty if none.
+        refused: by the reader of a bag, with its reason.
+        usual_step_s: median interval of the kept rows [s].
+        gaps_filled, gap_filled_s, longest_gap_s: gaps up to the limit, the time added in them, and
+            the longest gap that was filled [s].
+        gaps_cut: longer gaps, at which the recording was cut into pieces.
+        tail_dropped_s: less than a step at the ends of the pieces [s].
+        energy_before_j: of the kept rows, each held for its step [J].
+        energy_filled_j: of what was put into gaps [J].
+        energy_after_j: of the result; the sum of both less the tails [J].
+        duration_s, steps: of the result, all pieces together.
+    """
+
+    rows_read: int
+    rows_kept: int
+    dropped_not_a_number: int
+    dropped_absurd_power: int
+    dropped_duplicate_time: int
+    dropped_time_backwards: int
+    first_dropped: str
+    refused: dict[str, int]
+    usual_step_s: float
+    gaps_filled: int
+    gap_filled_s: float
+    longest_gap_s: float
+    gaps_cut: int
+    tail_dropped_s: float
+    energy_before_j: float
+    energy_filled_j: float
+    energy_after_j: float
+    duration_s: float
+    steps: int
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data."""
+        return asdict(self)
+
+
+def resample(samples: Samples, settings: ImportSettings) -> tuple[list[FloatArray], Account]:
+    """Demand at equal steps, one array per piece, and the account of what was done.
+
+    Raises:
+        CycleError: fewer than two usable rows, too many unusable ones, a gap longer than allowed,
+            less than one step of time, or more steps than any work has; the message names the
+            file, the row and the value.
+    """
+    fault = _faults(samples, settings)
+    kept = np.flatnonzero(fault == 0)
+    first = _first_dropped(samples, fault)
+    total = len(samples.time_s)
+    if len(kept) < 2:
+        raise CycleError(
+            f"{samples.source}: {len(kept)} usable rows of {total}, at least 2 are needed to know "
+            f"the step{f' ({first})' if first else ''}"
+        )
+    if total - len(kept) > settings.max_dropped * total:
+        raise CycleError(
+            f"{samples.source}: {total - len(kept)} of {total} rows are unusable, allowed "
+            f"{settings.max_dropped:.0%} (first: {first})"
+        )
+    time_s = samples.time_s[kept] - samples.time_s[kept[0]]
+    power_w = samples.power_demand_w[kept]
+    interval_s = np.diff(time_s)
+    usual_s = float(np.median(interval_s))
+    gap = interval_s > GAP * usual_s
+    too_long = gap & (interval_s > settings.max_gap_s)
+    if too_long.any() and not settings.split:
+        k = int(np.flatnonzero(too_long)[0])
+        raise CycleError(
+            f"{samples.source}: {samples.place_name} {samples.place[kept[k + 1]]}: gap of "
+            f"{interval_s[k]:.6g} s at {time_s[k]:.6g} s, filled are gaps up to "
+            f"{settings.max_gap_s:g} s (--max-gap-s; --split-gaps cuts the recording there)"
+        )
+    lasts_s = float(interval_s[~too_long].sum())
+    if lasts_s > MAX_STEPS * min(settings.dt_s, usual_s):
+        raise CycleError(
+            f"{samples.source}: lasts {lasts_s:.6g} s, allowed are {MAX_STEPS} steps of "
+            f"{settings.dt_s:g} s, and as many of its own {usual_s:.3g} s"
+        )
+    pieces, tails_s = [], 0.0
+    before_j, filled_j, filled_s = 0.0, 0.0, 0.0
+    edges = [0, *(np.flatnonzero(too_long) + 1).tolist(), len(time_s)]
+    for start, stop in pairwise(edges):
+        t, p, made = _filled(time_s[start:stop], power_w[start:stop], usual_s)
+        hold_s = np.append(np.diff(t), usual_s)
+        before_j += float(np.sum((p * hold_s)[~made]))
+        filled_j += float(np.sum((p * hold_s)[made]))
+        filled_s += float(np.sum(hold_s[made]))
+        demand_w, tail_s = _means(t - t[0], p, hold_s, settings.dt_s)
+        tails_s += tail_s
+        if len(demand_w):
+            pieces.append(demand_w)
+    if not pieces:
+        raise CycleError(
+            f"{samples.source}: lasts {time_s[-1] + usual_s:.6g} s, less than one step of "
+            f"{settings.dt_s:g} s"
+        )
+    steps = sum(map(len, pieces))
+    short = gap & ~too_long
+    return pieces, Account(
+        rows_read=total,
+        rows_kept=len(kept),
+        dropped_not_a_number=int(np.sum(fault == 1)),
+        dropped_absurd_power=int(np.sum(fault == 2)),
+        dropped_duplicate_time=int(np.sum(fault == 3)),
+        dropped_time_backwards=int(np.sum(fault == 4)),
+        first_dropped=first,
+        refused=dict(samples.refused),
+        usual_step_s=usual_s,
+        gaps_filled=int(short.sum()),
+        gap_filled_s=filled_s,
+        longest_gap_s=float(interval_s[short].max(initial=0.0)),
+        gaps_cut=int(too_long.sum()),
+        tail_dropped_s=tails_s,
+        energy_before_j=before_j,
+        energy_filled_j=filled_j,
+        energy_after_j=float(sum(piece.sum() for piece in pieces) * settings.dt_s),
+        duration_s=steps * settings.dt_s,
+        steps=steps,
+    )
+
+
+_FAULTS = ("", "not a number", "absurd power", "time given before", "time runs backwards")
+
+
+def _faults(samples: Samples, settings: ImportSettings) -> IntArray:
+    """Per row 0 or which of ``_FAULTS`` it has.
+
+    Of times that do not all rise, the most rows that do are kept: one wild stamp costs one row,
+    not all that follow it.
+    """
+    time_s, power_w = samples.time_s, samples.power_demand_w
+    fault = np.zeros(len(time_s), dtype=np.int64)
+    fault[~(np.isfinite(time_s) & np.isfinite(power_w))] = 1
+    fault[(fault == 0) & (np.abs(power_w) > settings.max_power_w)] = 2
+    usable = np.flatnonzero(fault == 0)
+    rising = _longest_rising(time_s[usable])
+    left_out = usable[~rising]
+    known = np.isin(time_s[left_out], time_s[usable[rising]])
+    fault[left_out] = np.where(known, 3, 4)
+    return fault
+
+
+def _longest_rising(values: FloatArray) -> BoolArray:
+    """Mask of a longest strictly rising subsequence.
+
+    Where it is as long, the one of values above all before them: what comes late is dropped.
+    """
+    greedy = np.ones(len(values), dtype=bool)
+    greedy[1:] = values[1:] > np.maximum.accumulate(values)[:-1]
+    if greedy.all():
+        return greedy
+    lowest_end: list[float] = []
+    row_of_end: list[int] = []
+    before = np.full(len(values), -1, dtype=np.int64)
+    for row, value in enumerate(values.tolist()):
+        length = bisect_left(lowest_end, value)
+        before[row] = row_of_end[length - 1] if length else -1
+        lowest_end[length : length + 1] = [value]
+        row_of_end[length : length + 1] = [row]
+    if len(lowest_end) == greedy.sum():
+        return greedy
+    mask = np.zeros(len(values), dtype=bool)
+    row = row_of_end[-1]
+    while row >= 0:
+        mask[row] = True
+        row = int(before[row])
+    return mask
+
+
+def _first_dropped(samples: Samples, fault: IntArray) -> str:
+    dropped = np.flatnonzero(fault)
+    if not len(dropped):
+        return ""
+    k = dropped[0]
+    return (
+        f"{samples.place_name} {samples.place[k]}: {_FAULTS[fault[k]]}, "
+        f"time_s {samples.time_s[k]:.9g}, power_demand_w {samples.power_demand_w[k]:.6g}"
+    )
+
+
+def _filled(
+    time_s: FloatArray, power_w: FloatArray, usual_s: float
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Samples with those that gaps lack put in, on straight lines, and which these are."""
+    interval_s = np.diff(time_s)
+    gaps = np.flatnonzero(interval_s > GAP * usual_s)
+    counts = np.rint(interval_s[gaps] / usual_s).astype(np.int64) - 1
+    at = np.repeat(gaps, counts)
+    which = np.concatenate([np.arange(1, n + 1) for n in counts] or [np.zeros(0, np.int64)])
+    share = which / np.repeat(counts + 1, counts)
+    new_s = time_s[at] + share * interval_s[at]
+    new_w = power_w[at] + share * (power_w[at + 1] - power_w[at])
+    made = np.zeros(len(time_s), dtype=bool)
+    return (
+        np.insert(time_s, at + 1, new_s),
+        np.insert(power_w, at + 1, new_w),
+        np.insert(made, at + 1, True),
+    )
+
+
+def _means(
+    time_s: FloatArray, power_w: FloatArray, hold_s: FloatArray, dt_s: float
+) -> tuple[FloatArray, float]:
+    """Mean of the held samples over whole steps, shape (steps,), and the time left over."""
+    end_s = np.append(time_s, time_s[-1] + hold_s[-1])
+    energy_j = np.concatenate(([0.0], np.cumsum(power_w * hold_s)))
+    steps = int(end_s[-1] / dt_s + 1e-6)
+    if steps == len(power_w) and np.allclose(time_s, dt_s * np.arange(steps), rtol=0, atol=1e-6):
+        return power_w.copy(), 0.0  # already at the step: the same to the bit
+    edge_s = np.minimum(dt_s * np.arange(steps + 1), end_s[-1])
+    demand_w = np.diff(np.interp(edge_s, end_s, energy_j)) / dt_s
+    return demand_w, max(0.0, float(end_s[-1]) - steps * dt_s)
