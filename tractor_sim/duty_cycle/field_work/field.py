@@ -75,7 +75,7 @@ def draw_field(
     fastest_s = cells * CELL_M / (1.3 * setup.speed_m_per_s) + 0.5 * turn_mean_s
     passes = int(duration_s / fastest_s) + 2
 
-    place_m = (np.arange(cells) + 0.5) * CELL_M
+    place_m = (np.arange(0.0, cells) + 0.5) * CELL_M
     slope = grades(rng, place_m, work.grade_max * rng.uniform(0.2, 1.0), (150.0, 600.0))
     grade = flip_alternate(np.tile(slope, (passes, 1)), sign=-1.0)
     ground = {"cell_m": CELL_M, "spacing_m": setup.width_m}

@@ -1,6 +1,7 @@
 """Drive a drawn field: speed under a power cap, time, energy, noise, seconds of demand."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tractor_msgs_py.trajectory import FloatArray
 from tractor_sim.duty_cycle.field_work.field import CELL_M, CREEP_M_PER_S, TURN_PIECES, Field
@@ -63,9 +64,8 @@ def drive_field(field: Field, vehicle: Vehicle, within: WithinPass, cap_w: float
     drive = steps(pass_w, turn_w, stop_w, vehicle.idle_w)
     power = drive.power_w
     moving = 1.0 - drive.standing
-    power = power * (
-        1.0 + field.noise * drive.working + field.turn_noise * (moving - drive.working)
-    )
+    noise = field.noise * drive.working + field.turn_noise * (moving - drive.working)
+    power = power * (1.0 + noise)
     if setup.work.plunger is not None:
         crop = steps(crop_w * move_s / pass_s, none_turn, none_stop, 0.0).power_w
         power = power + field.plunger * crop
@@ -77,12 +77,11 @@ def _capped_speed(field: Field, cap_w: float) -> FloatArray:
     limit = field.speed_limit_m_per_s
     setup = field.setup
 
-    def over(speed: FloatArray, at: FloatArray) -> FloatArray:
-        zero = np.zeros_like(speed)
-        need = setup.demand_w(speed, field.soil[at], field.crop[at], field.grade[at], zero)
-        return need > cap_w
+    def over(speed: FloatArray, at: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        soil, crop, grade = field.soil[at], field.crop[at], field.grade[at]
+        return setup.demand_w(speed, soil, crop, grade, np.zeros_like(speed)) > cap_w
 
-    everywhere = np.ones(limit.shape, dtype=bool)
+    everywhere = np.ones(limit.shape, dtype=np.bool_)
     at = over(limit.ravel(), everywhere).reshape(limit.shape)
     high = limit[at]
     low = np.full_like(high, CREEP_M_PER_S)

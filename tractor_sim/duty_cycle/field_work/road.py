@@ -49,7 +49,7 @@ def draw_route(rng: np.random.Generator, work: Road, duration_s: int) -> Route:
             dwell[end - 1] = rng.uniform(*work.stop_s)
         at = end
     limit = np.where(dwell > 0, _CREEP_M_PER_S, limit)
-    place_m = np.arange(cells) * _CELL_M
+    place_m = np.arange(0.0, cells) * _CELL_M
     grade = grades(rng, place_m, work.grade_max * rng.uniform(0.5, 1.0), work.wave_m)
     noise = work.noise_sd * autoregressive(rng, duration_s, work.noise_lag1)
     return Route(duration_s, mass_kg, limit, grade - grade.mean(), dwell, noise)

@@ -1,4 +1,4 @@
-"""From pieces of work with a duration and a power to equal steps of one second, and noise on it."""
+"""Pieces of work with a duration and a power, turned into equal steps of 1 s; noise on them."""
 
 from dataclasses import dataclass
 
