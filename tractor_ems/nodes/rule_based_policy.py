@@ -6,7 +6,8 @@ from typing import Any
 
 from tractor_ems.nodes.policy_node import PolicySetup, run_policy_node
 from tractor_ems.policies.protocol import Policy
-from tractor_ems.policies.rules import BestPoint, Conventional, MyopicGreedy, RuleBased
+from tractor_ems.policies.registry import RULES, make_rule
+from tractor_ems.policies.rules import RuleBased
 from tractor_msgs_py.ros.shell import Parameter
 from tractor_sim.config import load_powertrain
 from tractor_sim.powertrain_json import powertrain_hash
@@ -16,7 +17,7 @@ PARAMETERS = (
         "policy",
         "rule_based",
         "which rule decides",
-        choices=("rule_based", "conventional", "best_point", "myopic_greedy"),
+        choices=("rule_based", *(name for name in RULES if name != "rule_based")),
     ),
     Parameter("powertrain", "paper", "powertrain, a shipped name or a YAML file"),
     Parameter("threshold_w", 110e3, "rule_based: engine when demand exceeds this", "W", 0, 1e9),
@@ -34,21 +35,16 @@ def prepare(values: Mapping[str, Any]) -> PolicySetup:
     """The chosen rule for the named powertrain."""
     params = load_powertrain(values["powertrain"])
     policy: Policy
-    match values["policy"]:
-        case "conventional":
-            policy = Conventional()
-        case "best_point":
-            policy = BestPoint(params)
-        case "myopic_greedy":
-            policy = MyopicGreedy(params)
-        case _:
-            policy = RuleBased(
-                params,
-                threshold_w=values["threshold_w"],
-                soc_guard=values["soc_guard"],
-                guard_margin=values["guard_margin"],
-                guard_release=values["guard_release"],
-            )
+    if values["policy"] == "rule_based":
+        policy = RuleBased(
+            params,
+            threshold_w=values["threshold_w"],
+            soc_guard=values["soc_guard"],
+            guard_margin=values["guard_margin"],
+            guard_release=values["guard_release"],
+        )
+    else:
+        policy = make_rule(values["policy"], params)
     return PolicySetup(policy, powertrain_hash(params))
 
 

@@ -2,14 +2,26 @@
 
 from pathlib import Path
 
+from tractor_ems.policies.ecms import NeverStopEcms
+from tractor_ems.policies.levelling import LoadLevelling
 from tractor_ems.policies.protocol import Policy
 from tractor_ems.policies.rules import BestPoint, Conventional, MyopicGreedy, RuleBased
 from tractor_ems.scenario import Scenario
 from tractor_msgs_py.errors import PolicyError
+from tractor_sim.powertrain import PowertrainParams
 from tractor_sim.powertrain_json import powertrain_hash
 from tractor_sim.resources import resource_path
 
-RULES = ("conventional", "rule_based", "best_point", "myopic_greedy")
+RULES = (
+    "conventional",
+    "rule_based",
+    "best_point",
+    "myopic_greedy",
+    "load_levelling",
+    "never_stop_ecms",
+)
+"""Policies that need neither training nor the future."""
+
 NAMES = (*RULES, "dp", "default")
 
 
@@ -31,6 +43,28 @@ def policy_file(name: str, powertrain: str) -> Path:
     return Path(name)
 
 
+def make_rule(name: str, params: PowertrainParams) -> Policy:
+    """One of :data:`RULES` with its documented defaults.
+
+    Raises:
+        PolicyError: no such rule.
+    """
+    match name:
+        case "conventional":
+            return Conventional()
+        case "rule_based":
+            return RuleBased(params)
+        case "best_point":
+            return BestPoint(params)
+        case "myopic_greedy":
+            return MyopicGreedy(params)
+        case "load_levelling":
+            return LoadLevelling(params)
+        case "never_stop_ecms":
+            return NeverStopEcms(params)
+    raise PolicyError(f"policy {name!r}: no rule, rules are {', '.join(RULES)}")
+
+
 def make_policy(
     name: str,
     scenario: Scenario,
@@ -50,14 +84,10 @@ def make_policy(
         PolicyError: unknown name, unreadable file, or a file made for another powertrain.
     """
     params = scenario.params
-    if name == "conventional":
-        return Conventional()
     if name == "rule_based":
         return RuleBased(params, soc_guard=soc_guard)
-    if name == "best_point":
-        return BestPoint(params)
-    if name == "myopic_greedy":
-        return MyopicGreedy(params)
+    if name in RULES:
+        return make_rule(name, params)
     if name == "dp":
         from tractor_ems.policies.dp import solve_policy
 

@@ -1,5 +1,5 @@
 """Rules that need no model of the future: conventional, best point, the paper's rule base, and
-myopic greedy.
+myopic greedy. Load levelling and ECMS stand in files of their own.
 
 Each policy is a frozen dataclass of its settings; memory, where there is any, is its state.
 """
@@ -9,11 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from tractor_ems.learning.rewards import best_specific_fuel_kg_per_j
+from tractor_ems.policies.genset import HOLD_ON_W, best_power_w
 from tractor_ems.policies.protocol import ANY_RUN, limits_of
 from tractor_msgs_py.observation import Observation, ObservationSpec
 from tractor_msgs_py.trajectory import BoolArray, FloatArray
-from tractor_sim.engine import best_power_w, fuel_rate_kg_per_s
-from tractor_sim.generator import to_bus_w, to_crank_w
+from tractor_sim.engine import fuel_rate_kg_per_s
+from tractor_sim.generator import to_crank_w
 from tractor_sim.powertrain import (
     Command,
     PowertrainParams,
@@ -31,7 +32,11 @@ def _command(battery_power_w: FloatArray, engine_off: BoolArray) -> Command:
 
 @dataclass(frozen=True)
 class Conventional:
-    """The engine follows the load; the battery only helps above the engine's maximum."""
+    """The engine follows the load and idles where there is none; the battery only helps above the
+    engine's maximum, while the engine starts or ramps, and takes what flows back.
+
+    Its SOC drifts by that help alone and nothing brings it back.
+    """
 
     name: str = "conventional"
     spec: ObservationSpec = ANY_RUN
@@ -41,17 +46,20 @@ class Conventional:
         return NO_STATE
 
     def act(self, observation: Observation, state: None) -> tuple[Command, None]:
-        """Zero battery power, projected on the feasible set."""
+        """Zero battery power, projected on the feasible set; never less than idling."""
         demand_w = observation.power_demand_w
         lb, ub = feasible_battery_power_w(limits_of(observation), demand_w)
-        return _command(project(np.zeros_like(demand_w), lb, ub), demand_w <= 0.0), state
+        battery_w = np.minimum(np.zeros_like(demand_w), demand_w - HOLD_ON_W)
+        return _command(project(battery_w, lb, ub), np.zeros(demand_w.shape, bool)), state
 
 
 @dataclass(frozen=True)
 class BestPoint:
     """The engine always at its best-efficiency power while SOC allows; the battery is the slack.
 
-    On "paper" this is nearly optimal, so a high score there proves little: every table shows it.
+    Best at the bus, generator included. On "paper" this is nearly optimal, so a high score there
+    proves little: every table shows it. Nothing but the window bounds its SOC: in work lighter
+    than the best power it ends full, in heavier work empty.
     """
 
     powertrain: PowertrainParams
@@ -64,10 +72,7 @@ class BestPoint:
 
     def act(self, observation: Observation, state: None) -> tuple[Command, None]:
         """Battery power that leaves the engine its best power."""
-        engine = self.powertrain.engine
-        best_w = to_bus_w(
-            self.powertrain.generator, np.array(best_power_w(engine)), engine.power_max_w
-        )
+        best_w = best_power_w(self.powertrain)
         demand_w = observation.power_demand_w
         lb, ub = feasible_battery_power_w(limits_of(observation), demand_w)
         return _command(project(demand_w - best_w, lb, ub), np.zeros(demand_w.shape, bool)), state
@@ -80,7 +85,8 @@ class RuleBased:
 
     The guard (not in the paper) engages at SOC_min + ``guard_margin`` and holds until
     ``guard_release`` above that: the engine then runs at its best power or the demand, whichever
-    is more, and the battery takes the surplus.
+    is more, and the battery takes the surplus. So SOC stays above SOC_min but does not return to
+    its target: in light work it ends just above the guard.
     """
 
     powertrain: PowertrainParams
@@ -97,16 +103,13 @@ class RuleBased:
 
     def act(self, observation: Observation, state: BoolArray) -> tuple[Command, BoolArray]:
         """Engine follows the load above the threshold, else off; the guard overrules."""
-        engine = self.powertrain.engine
         demand_w = observation.power_demand_w
         engage_soc = self.powertrain.battery.soc_min + self.guard_margin
         engaged = np.where(
             state, observation.soc < engage_soc + self.guard_release, observation.soc < engage_soc
         )
         guard = engaged & self.soc_guard
-        best_w = to_bus_w(
-            self.powertrain.generator, np.array(best_power_w(engine)), engine.power_max_w
-        )
+        best_w = best_power_w(self.powertrain)
         engine_w = np.where(demand_w > self.threshold_w, demand_w, 0.0)
         engine_w = np.where(guard, np.maximum(demand_w, best_w), engine_w)
         lb, ub = feasible_battery_power_w(limits_of(observation), demand_w)
@@ -119,7 +122,9 @@ class MyopicGreedy:
     at one fixed price.
 
     The price is the engine's best specific fuel, the co-state of a lossless battery. It shows
-    how much of a learner's score needs no learning.
+    how much of a learner's score needs no learning. It sees idle and start fuel; a start never
+    pays within one step, so it empties the battery first, and on a plant whose engine starts and
+    ramps slowly it then fails to meet the demand.
     """
 
     powertrain: PowertrainParams
@@ -142,7 +147,9 @@ class MyopicGreedy:
         candidates_w = project(grid_w[None, :], lb[:, None], ub[:, None])
         engine_w = np.maximum(demand_w[:, None] - candidates_w, 0.0)
         crank_w = to_crank_w(generator, engine_w, engine.power_max_w)
-        cost = fuel_rate_kg_per_s(engine, crank_w) + price_kg_per_j * candidates_w
+        starts = ~observation.engine_on[:, None] & (engine_w > 0.0)
+        start_kg_per_s = np.where(starts, engine.start_fuel_kg / params.dt_s, 0.0)
+        cost = fuel_rate_kg_per_s(engine, crank_w) + start_kg_per_s + price_kg_per_j * candidates_w
         chosen = np.argmin(cost, axis=1)[:, None]
         battery_w = np.take_along_axis(candidates_w, chosen, axis=1)[:, 0]
         return _command(battery_w, battery_w >= demand_w), state
