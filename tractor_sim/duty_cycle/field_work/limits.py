@@ -25,12 +25,13 @@ def drive_within_limits(drive: Callable[[float], Steps], vehicle: Vehicle) -> St
     Args:
         drive: demand of the same draw under a power cap [W].
         vehicle: its ``cap_w`` is tried first; mean over ``mean_window_s`` must stay below
-            ``mean_max_w``. Single seconds above ``sample_max_w`` are cut there.
+            ``mean_max_w``. Noise above ``sample_max_w`` or
+            below what braking gives back is cut there.
     """
     cap_w = vehicle.cap_w
     for _ in range(_ROUNDS):
         steps = drive(cap_w)
-        power = np.minimum(steps.power_w, vehicle.sample_max_w)
+        power = np.clip(steps.power_w, -vehicle.regeneration_max_w, vehicle.sample_max_w)
         highest = highest_window_mean_w(power, vehicle.mean_window_s)
         if highest <= vehicle.mean_max_w:
             return Steps(power, steps.working, steps.standing, steps.distance_m)

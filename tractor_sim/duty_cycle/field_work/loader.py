@@ -56,14 +56,15 @@ def _cycle(
     def speed() -> float:
         return float(rng.uniform(*work.speed_km_h)) / 3.6
 
-    rise_j = (payload_kg + work.boom_kg) * GRAVITY_M_PER_S2 * place["height"]
+    tilt_w = work.tilt_hydraulic_w / work.oil_efficiency
+    rise_j = (payload_kg + work.boom_kg) * GRAVITY_M_PER_S2 * place["height"] / work.oil_efficiency
     loaded = work.weight_kg + payload_kg
     dig_s = float(rng.uniform(*work.dig_s))
     dig_axle_w = float(rng.uniform(*work.dig_force_n)) * work.dig_speed_km_h / 3.6
     # The bucket is crowded and curled in bursts while the wheels push.
-    bursts = rng.dirichlet(np.full(4, 3.0)) * 4.0
+    bursts = rng.dirichlet(np.full(4, 8.0)) * 4.0
     dig = [
-        (dig_s / 4, _bus_w(drive, dig_axle_w * (0.6 + 0.4 * b), work.tilt_hydraulic_w * b), 0.0)
+        (dig_s / 4, _bus_w(drive, dig_axle_w * (0.6 + 0.4 * b), tilt_w * b), 0.0)
         for b in bursts.tolist()
     ]
     return [
@@ -71,7 +72,7 @@ def _cycle(
         *dig,
         *_leg(drive, work, loaded, place["approach"], speed(), 0.35 * rise_j),
         *_leg(drive, work, loaded, place["haul"], 0.8 * speed(), 0.65 * rise_j),
-        (float(rng.uniform(*work.dump_s)), _bus_w(drive, 0.0, 0.6 * work.tilt_hydraulic_w), 0.0),
+        (float(rng.uniform(*work.dump_s)), _bus_w(drive, 0.0, 0.6 * tilt_w), 0.0),
         *_leg(drive, work, work.weight_kg, place["haul"], speed(), 0.0),
     ]
 

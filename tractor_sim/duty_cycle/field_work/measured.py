@@ -50,7 +50,8 @@ def draw_job(
     noise = job.noise_sd * autoregressive(rng, duration_s, job.noise_lag1)
     turn_noise = job.turn_noise_sd * autoregressive(rng, duration_s, job.turn_noise_lag1)
     high = level > turning
-    fraction = np.where(high, level + noise * (level > 0.3), turning + turn_noise)
+    quiet = ~high | (level < 0.3)
+    fraction = np.maximum(level, turning) + np.where(quiet, turn_noise, noise)
     fraction = np.where(idle & ~high, job.idle_level * (1.0 + 2.0 * noise), fraction)
     power = np.clip(fraction, 0.01, 1.0) * vehicle.rated_power_w
     return Steps(power, working, idle.astype(float), 0.0)

@@ -118,6 +118,7 @@ class FieldWork(_Strict):
     wheel_numeric: Range
     ballast_kg: Annotated[float, Field(ge=-5e3, le=2e4)]
     implement_kg: NotNegative
+    cart_kg: NotNegative = 0.0
     rolling: Share
     field_length_m: Range
     grade_max: Annotated[float, Field(ge=0, le=0.3)]
@@ -148,6 +149,7 @@ class Loader(_Strict):
     dig_speed_km_h: Positive
     lift_height_m: Range
     boom_kg: NotNegative
+    oil_efficiency: Efficiency
     tilt_hydraulic_w: NotNegative
     dump_s: Range
     trucks_every_cycles: Annotated[tuple[int, int], Field()]

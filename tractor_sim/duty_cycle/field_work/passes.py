@@ -65,7 +65,7 @@ def drive_field(field: Field, vehicle: Vehicle, within: WithinPass, cap_w: float
     power = drive.power_w
     moving = 1.0 - drive.standing
     noise = field.noise * drive.working + field.turn_noise * (moving - drive.working)
-    power = power * (1.0 + noise)
+    power = power * np.maximum(1.0 + noise, 0.2)
     if setup.work.plunger is not None:
         crop = steps(crop_w * move_s / pass_s, none_turn, none_stop, 0.0).power_w
         power = power + field.plunger * crop

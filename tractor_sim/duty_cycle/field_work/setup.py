@@ -24,6 +24,10 @@ def driveline(vehicle: Vehicle) -> Driveline:
     )
 
 
+_SOIL_MIN = 0.4
+"""Below this share of its mean draft, an implement is on its way up or down."""
+
+
 @dataclass(frozen=True)
 class Setup:
     """Tractor, implement and soil of one draw.
@@ -71,11 +75,13 @@ class Setup:
             acceleration_m_per_s2: of tractor and implement.
         """
         work = self.work
-        mass = self.tractor_kg + work.implement_kg
-        pull = (
-            work.implement_kg * GRAVITY_M_PER_S2 * work.rolling
-            + mass * GRAVITY_M_PER_S2 * grade
-            + mass * acceleration_m_per_s2
+        mass = self.tractor_kg + work.implement_kg + work.cart_kg
+        rolls_kg = work.implement_kg + work.cart_kg
+        if work.d497 is not None:
+            # The standard's draft holds the implement's own rolling resistance.
+            rolls_kg = rolls_kg - work.implement_kg * np.minimum(soil / _SOIL_MIN, 1.0)
+        pull = rolls_kg * GRAVITY_M_PER_S2 * work.rolling + mass * (
+            GRAVITY_M_PER_S2 * grade + acceleration_m_per_s2
         )
         if work.d497 is not None:
             draft = soil * draft_n(

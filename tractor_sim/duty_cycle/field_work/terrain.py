@@ -35,7 +35,7 @@ def patches(
 def grades(
     rng: np.random.Generator, place_m: FloatArray, grade_max: float, waves_m: tuple[float, float]
 ) -> FloatArray:
-    """Rise over run along a line: an even tilt and three waves, within +-grade_max, shape (N,).
+    """Rise over run along a line: an even tilt and five waves, within +-grade_max, shape (N,).
 
     Args:
         rng: draws tilt, wavelengths within ``waves_m`` and phases.
@@ -43,10 +43,10 @@ def grades(
         grade_max: largest grade [-].
         waves_m: shortest and longest wave [m].
     """
-    shares = np.array([0.35, 0.30, 0.20, 0.15])
+    shares = np.array([0.30, 0.18, 0.16, 0.14, 0.12, 0.10])
     tilt = rng.uniform(-1.0, 1.0)
-    lengths = rng.uniform(*waves_m, 3)
-    phases = rng.uniform(0.0, 2.0 * np.pi, 3)
+    lengths = waves_m[0] * (waves_m[1] / waves_m[0]) ** rng.random(5)
+    phases = rng.uniform(0.0, 2.0 * np.pi, 5)
     waves = np.sin(2.0 * np.pi * place_m[:, None] / lengths + phases)
     grade: FloatArray = grade_max * (shares[0] * tilt + waves @ shares[1:])
     return grade
