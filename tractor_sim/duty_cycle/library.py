@@ -101,9 +101,9 @@ def cycle_names(split: Split | None = None) -> list[str]:
 
 def operations() -> tuple[str, ...]:
     """Names of the operations that :func:`generate_cycle` knows."""
-    from tractor_sim.duty_cycle.generate import OPERATIONS
+    from tractor_sim.duty_cycle.generate import MEASURED_JOBS, OPERATIONS
 
-    return ("planter", *(name for name in OPERATIONS if name != "planter"))
+    return ("planter", *OPERATIONS, *MEASURED_JOBS)
 
 
 def load_cycle(name_or_path: str | Path) -> DutyCycle:

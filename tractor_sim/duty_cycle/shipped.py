@@ -11,7 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from tractor_msgs_py.atomic import write_json
-from tractor_msgs_py.errors import ConfigError
+from tractor_msgs_py.errors import ConfigError, CycleError
 from tractor_msgs_py.trajectory import FloatArray
 from tractor_sim.duty_cycle.cycle import DutyCycle, cycle_hash, demand_fingerprint
 from tractor_sim.duty_cycle.library import cycle_names, listed_cycles, load_cycle
@@ -68,8 +68,9 @@ def _names() -> dict[str, str]:
 
 
 @lru_cache(maxsize=1)
-def _held_out() -> frozenset[str]:
-    return frozenset(row.name for row in listed_cycles("held_out"))
+def _held_out() -> tuple[frozenset[str], frozenset[str]]:
+    rows = listed_cycles("held_out")
+    return frozenset(row.name for row in rows), frozenset(row.operation for row in rows)
 
 
 def listed_name(power_demand_w: FloatArray, dt_s: float) -> str | None:
@@ -83,15 +84,34 @@ def held_out_name(
     """Name of the held-out cycle that a recording drives, or None.
 
     By what it holds, by the cycle hash that its plant announced, or by the name that it
-    announced: any of them is enough, as one alone can be missing.
+    announced: any of them is enough, as one alone can be missing. The name also tells unlisted
+    seeds of a held-out operation. A part of a recording that announces nothing is not known.
 
     Args:
         power_demand_w: shape (T,); auxiliaries may be in it [W].
         dt_s: step length [s].
         recorded_hash, recorded_name: of ``run_info``; empty where there is none.
     """
-    candidates = (_names().get(recorded_hash), recorded_name, listed_name(power_demand_w, dt_s))
-    return next((name for name in candidates if name in _held_out()), None)
+    names, operations = _held_out()
+    for name in (_names().get(recorded_hash), listed_name(power_demand_w, dt_s)):
+        if name in names:
+            return name
+    operation, _, seed = recorded_name.rpartition("_")
+    return recorded_name if operation in operations and seed.isdigit() else None
+
+
+def refuse_held_out(cycle: DutyCycle) -> None:
+    """For whatever trains or tunes on a cycle.
+
+    Raises:
+        CycleError: the cycle is held out, by split, content or name.
+    """
+    name = held_out_name(cycle.power_demand_w, cycle.dt_s, recorded_name=cycle.name)
+    if name is not None or cycle.split == "held_out":
+        raise CycleError(
+            f"cycle {cycle.name}: is {name or cycle.name}, a held-out cycle that training and "
+            "tuning must not see"
+        )
 
 
 def with_shipped_split(cycle: DutyCycle) -> DutyCycle:

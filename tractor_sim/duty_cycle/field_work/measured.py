@@ -17,8 +17,8 @@ def draw_job(
 ) -> Steps:
     """Demand of one draw at steps of 1 s; ``working`` is the recording's state of that name.
 
-    Power follows a level that is high in stretches of work and falls from ``turn_first`` to
-    ``turn_last`` between them; it rises and falls at the measured ramps.
+    Power follows a level that is high in stretches of work and moves along ``turn_level`` (at
+    the start, middle and end of a turn) between them; it rises and falls at measured ramps.
     """
     time_s = np.arange(duration_s) + 0.5
     level = np.zeros(duration_s)
@@ -29,9 +29,10 @@ def draw_job(
         if start > duration_s:
             break
         onset = start + rng.normal(*job.onset_s)
-        if whole and rng.random() < job.late_chance:
-            onset += rng.uniform(*job.late_s)
         release = end + rng.normal(*job.end_lag_s)
+        if whole and rng.random() < job.late_chance:
+            late_s = rng.uniform(*job.late_s)
+            onset, release = onset + late_s, release + late_s
         rise, fall = rng.uniform(*job.rise_per_s), rng.uniform(*job.fall_per_s)
         near = slice(max(0, int(start) - 15), min(duration_s, int(end) + 15))
         shape = np.minimum((time_s[near] - onset) * rise, (release - time_s[near]) * fall + height)
@@ -44,9 +45,9 @@ def draw_job(
     for start, end in zip(turn_starts, turn_ends, strict=True):
         inside = (time_s >= start - 10) & (time_s < end + 10)
         along = np.clip((time_s[inside] - start) / min(max(end - start, 1.0), 60.0), 0.0, 1.0)
-        turning[inside] = job.turn_first + (job.turn_last - job.turn_first) * along
+        turning[inside] = np.interp(along, (0.0, 0.5, 1.0), job.turn_level)
         if end - start > job.piece_gap_s[1]:
-            idle |= (time_s >= start + 35.0) & (time_s < end - 32.0)
+            idle |= (time_s >= start + 25.0) & (time_s < end - 32.0)
     noise = job.noise_sd * autoregressive(rng, duration_s, job.noise_lag1)
     turn_noise = job.turn_noise_sd * autoregressive(rng, duration_s, job.turn_noise_lag1)
     high = level > turning

@@ -213,8 +213,7 @@ class MeasuredJob(_Strict):
     rise_per_s: Range
     fall_per_s: Range
     end_lag_s: tuple[float, NotNegative]
-    turn_first: NotNegative
-    turn_last: NotNegative
+    turn_level: tuple[Share, Share, Share]
     turn_noise_sd: NotNegative
     turn_noise_lag1: Lag1
     pieces_per_block: Annotated[tuple[int, int], Field()]

@@ -76,7 +76,7 @@ class Setup:
         """
         work = self.work
         mass = self.tractor_kg + work.implement_kg + work.cart_kg
-        rolls_kg = work.implement_kg + work.cart_kg
+        rolls_kg = np.full_like(soil, work.implement_kg + work.cart_kg)
         if work.d497 is not None:
             # The standard's draft holds the implement's own rolling resistance.
             rolls_kg = rolls_kg - work.implement_kg * np.minimum(soil / _SOIL_MIN, 1.0)
