@@ -51,12 +51,12 @@ def test_a_row_adds_up():
 
 
 def test_a_held_out_cycle_is_marked():
-    cycle = load_cycle("planter_1001")
+    cycle = load_cycle("rotary_hoe_2001")
     assert row(driven(Conventional(), cycle), cycle).held_out
 
 
 def test_a_cycle_that_the_policy_was_trained_on_is_not_held_out_for_it():
-    cycle = load_cycle("planter_1001")
+    cycle = load_cycle("rotary_hoe_2001")
     result = summarise(
         driven(Conventional(), cycle),
         policy="p",

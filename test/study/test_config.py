@@ -37,6 +37,8 @@ def changed(tmp_path: Path, change) -> Path:
         (lambda d: d["experts"].update(dp_share=0.8), r"experts\.rule_share: 0\.25"),
         (lambda d: d.update(soc_initial=0.95), r"soc_initial: 0\.95, allowed 0\.7\.\.0\.9"),
         (lambda d: d.update(soc_target=0.8), r"soc_target: 0\.8, allowed 0\.836\.\.0\.9 in row"),
+        (lambda d: d.update(cycle="rotary_hoe_2001"), r"cycle: .*rotary_hoe_2001, a held-out"),
+        (lambda d: d.update(cycle="planter_x"), "cycle: .*planter_x"),
         (lambda d: d["differences"][0].pop("why"), r"differences\.0\.why"),
     ],
 )

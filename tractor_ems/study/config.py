@@ -11,8 +11,10 @@ from tractor_ems.learning.config import Count, Discount, Fraction, Rate, Widths
 from tractor_ems.learning.mdp import ActionMapping
 from tractor_ems.learning.rewards import RewardKind
 from tractor_ems.study.rows import Algorithm, Row, SeedingKind
-from tractor_msgs_py.errors import ConfigError
+from tractor_msgs_py.errors import ConfigError, CycleError
 from tractor_sim.config import describe, load_powertrain
+from tractor_sim.duty_cycle.library import load_cycle
+from tractor_sim.duty_cycle.shipped import refuse_held_out
 from tractor_sim.resources import resource_path
 from tractor_sim.yaml_file import read_yaml
 
@@ -262,6 +264,10 @@ def _check(path: Path, file: _File, rows: tuple[Row, ...]) -> None:
                 f"{path}: networks.warm_up: {networks.warm_up}, allowed at most the replay's "
                 f"capacity, {capacity} in preset {name}"
             )
+    try:
+        refuse_held_out(load_cycle(file.cycle))
+    except CycleError as error:
+        raise ConfigError(f"{path}: cycle: {error}") from None
     soc_max = load_powertrain(file.powertrain).battery.soc_max
     for row in rows:
         for name in ("soc_initial", "soc_target"):
