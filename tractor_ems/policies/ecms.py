@@ -13,6 +13,7 @@ from tractor_ems.policies.genset import (
     running_fuel_kg_per_s,
 )
 from tractor_ems.policies.protocol import ANY_RUN, limits_of
+from tractor_ems.policies.reserve import beyond_battery_w
 from tractor_msgs_py.errors import PolicyError
 from tractor_msgs_py.observation import Observation, ObservationSpec
 from tractor_msgs_py.trajectory import FloatArray
@@ -37,7 +38,7 @@ class NeverStopEcms:
 
     in watts of fuel; V_oc I is what the battery loses inside, resistance included. The engine
     starts when running, at whatever power, costs less than not running, or when the battery
-    alone cannot carry the load. From then on it idles at least.
+    should not carry the load alone. From then on it idles at least.
 
     With a full battery and no demand nothing can take the engine's power: the plant stops it then.
 
@@ -83,8 +84,8 @@ class NeverStopEcms:
         unhurried = project(running, least_w[:, None], ub[:, None])
         off_cost = self._cost_w(price, soc, demand_w[:, None], demand_w[:, None])[:, 0]
         on_cost = np.min(self._cost_w(price, soc, demand_w[:, None], unhurried), axis=1)
-        run = observation.engine_on | (demand_w > observation.discharge_limit_w)
-        run = run | (on_cost < off_cost)
+        beyond_w = beyond_battery_w(params, demand_w, observation.discharge_limit_w)
+        run = observation.engine_on | (on_cost < off_cost) | (beyond_w > 0.0) | (demand_w > ub)
 
         candidates_w = project(running, lb[:, None], np.minimum(ub, demand_w - HOLD_ON_W)[:, None])
         cost_w = self._cost_w(price, soc, demand_w[:, None], candidates_w)

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tractor_ems.policies.genset import HOLD_ON_W, power_max_w
+from tractor_ems.policies.genset import power_max_w
 from tractor_ems.policies.protocol import limits_of
+from tractor_ems.policies.reserve import beyond_battery_w, hold_power_w, must_hold, recent_peak_w
 from tractor_msgs_py.errors import PolicyError
 from tractor_msgs_py.observation import DemandFilter, Observation, ObservationSpec
+from tractor_msgs_py.trajectory import FloatArray
 from tractor_sim.powertrain import (
     Command,
     PowertrainParams,
@@ -29,7 +31,9 @@ class LoadLevelling:
     ``stop_share P_max``; a stopped one starts when P reaches ``start_share P_max``. P_max is
     the engine's most at the bus. In heavy work P stays high and the engine never stops. In light
     work the engine gives more than the mean, SOC rises until P falls to the stop, and SOC swings
-    by ``(start_share - stop_share) P_max soc_time_s / E``: 0.07 on "field".
+    by ``(start_share - stop_share) P_max soc_time_s / E``: 0.11 on "field". Where an
+    engine is not back at once (see ``reserve``) it is started for demand that the battery should
+    not carry alone, and held, idling where P is none, while such peaks are recent.
 
     Attributes:
         powertrain: what it drives.
@@ -66,24 +70,27 @@ class LoadLevelling:
         """The slow mean comes as the observation's only feature."""
         return ObservationSpec(filters=(DemandFilter("low_pass", self.mean_time_s),))
 
-    def init(self, batch: int) -> None:
-        """No memory: the mean is observed, and so is whether the engine runs."""
-        return None
+    def init(self, batch: int) -> FloatArray:
+        """No peak seen, shape (B,). The mean is observed, and so is whether the engine runs."""
+        return np.zeros(batch)
 
-    def act(self, observation: Observation, state: None) -> tuple[Command, None]:
+    def act(self, observation: Observation, state: FloatArray) -> tuple[Command, FloatArray]:
         """Engine at the level or off; both projected on what the battery allows."""
         most_w = power_max_w(self.powertrain)
         gain_w = self.powertrain.battery.energy_j / self.soc_time_s
         level_w = observation.features[:, 0] + gain_w * (observation.soc_target - observation.soc)
-        run = np.where(
-            observation.engine_on,
-            level_w > self.stop_share * most_w,
-            level_w >= self.start_share * most_w,
-        )
-        engine_w = np.maximum(level_w, max(self.least_share * most_w, HOLD_ON_W))
         demand_w = observation.power_demand_w
+        peak_w = recent_peak_w(self.powertrain, state, demand_w)
+        discharge_w = observation.discharge_limit_w
+        needed_w = beyond_battery_w(self.powertrain, demand_w, discharge_w)
+        wanted = level_w > np.where(
+            observation.engine_on, self.stop_share * most_w, self.start_share * most_w
+        )
+        held = observation.engine_on & must_hold(self.powertrain, peak_w, discharge_w)
+        run = wanted | held | (needed_w > 0.0)
+        least_w = np.where(wanted, self.least_share * most_w, 0.0)
+        hold_w = hold_power_w(self.powertrain, peak_w, discharge_w)
+        engine_w = np.maximum.reduce([level_w, least_w, needed_w, hold_w])
         lb, ub = feasible_battery_power_w(limits_of(observation), demand_w)
         battery_w = project(np.where(run, demand_w - engine_w, demand_w), lb, ub)
-        # Off is said only where the battery can carry the load: "off" would otherwise make the
-        # plant start the engine at the least power instead of the level.
-        return Command(battery_w, np.where(run | (demand_w > ub), np.nan, 0.0)), state
+        return Command(battery_w, np.where(run, np.nan, 0.0)), peak_w

@@ -11,6 +11,8 @@ import numpy as np
 from tractor_ems.learning.rewards import best_specific_fuel_kg_per_j
 from tractor_ems.policies.genset import HOLD_ON_W, best_power_w
 from tractor_ems.policies.protocol import ANY_RUN, limits_of
+from tractor_ems.policies.reserve import hold_power_w, must_hold, recent_peak_w, starts_slowly
+from tractor_msgs_py.errors import PolicyError
 from tractor_msgs_py.observation import Observation, ObservationSpec
 from tractor_msgs_py.trajectory import BoolArray, FloatArray
 from tractor_sim.engine import fuel_rate_kg_per_s
@@ -58,13 +60,25 @@ class BestPoint:
     """The engine always at its best-efficiency power while SOC allows; the battery is the slack.
 
     Best at the bus, generator included. On "paper" this is nearly optimal, so a high score there
-    proves little: every table shows it. Nothing but the window bounds its SOC: in work lighter
-    than the best power it ends full, in heavier work empty.
+    proves little: every table shows it. SOC does not return to its target: in work lighter than
+    the best power it ends full, in heavier work empty.
+
+    Where an engine is not back at once (not on the paper's plant) ``margin`` keeps it from the
+    ends of its window, where the plant would have to stop the engine: within it the engine goes
+    over to following the load, x = 1 to 0, and beyond to bringing SOC back, P = P_dem + x (P_best
+    - P_dem).
+
+    Raises PolicyError where ``margin`` is not in 0 < margin <= 0.2.
     """
 
     powertrain: PowertrainParams
+    margin: float = 0.02
     name: str = "best_point"
     spec: ObservationSpec = ANY_RUN
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.margin <= 0.2:
+            raise PolicyError(f"best_point.margin: {self.margin}, allowed 0 < margin <= 0.2")
 
     def init(self, batch: int) -> None:
         """No memory."""
@@ -74,8 +88,26 @@ class BestPoint:
         """Battery power that leaves the engine its best power."""
         best_w = best_power_w(self.powertrain)
         demand_w = observation.power_demand_w
+        surplus_w = best_w - demand_w
+        engine_w = np.full_like(demand_w, best_w)
+        if starts_slowly(self.powertrain):
+            battery = self.powertrain.battery
+            to_full = (battery.soc_max - self.margin - observation.soc) / self.margin
+            to_empty = (observation.soc - battery.soc_min - self.margin) / self.margin
+            share = np.clip(np.where(surplus_w > 0.0, to_full, to_empty), -1.0, 1.0)
+            engine_w = np.maximum(demand_w + share * surplus_w, HOLD_ON_W)
         lb, ub = feasible_battery_power_w(limits_of(observation), demand_w)
-        return _command(project(demand_w - best_w, lb, ub), np.zeros(demand_w.shape, bool)), state
+        return _command(
+            project(demand_w - engine_w, lb, ub), np.zeros(demand_w.shape, bool)
+        ), state
+
+
+@dataclass(frozen=True)
+class RuleState:
+    """Memory of the rule base, each of shape (B,): guard engaged, recent peak demand [W]."""
+
+    engaged: BoolArray
+    peak_w: FloatArray
 
 
 @dataclass(frozen=True)
@@ -87,6 +119,9 @@ class RuleBased:
     ``guard_release`` above that: the engine then runs at its best power or the demand, whichever
     is more, and the battery takes the surplus. So SOC stays above SOC_min but does not return to
     its target: in light work it ends just above the guard.
+
+    Where an engine is not back at once (not on the paper's plant) it idles instead of stopping
+    while peaks are recent that the battery should not carry alone.
     """
 
     powertrain: PowertrainParams
@@ -97,23 +132,29 @@ class RuleBased:
     name: str = "rule_based"
     spec: ObservationSpec = ANY_RUN
 
-    def init(self, batch: int) -> BoolArray:
-        """Guard not engaged, shape (B,)."""
-        return np.zeros(batch, dtype=bool)
+    def init(self, batch: int) -> RuleState:
+        """Guard not engaged, no peak seen."""
+        return RuleState(np.zeros(batch, dtype=bool), np.zeros(batch))
 
-    def act(self, observation: Observation, state: BoolArray) -> tuple[Command, BoolArray]:
-        """Engine follows the load above the threshold, else off; the guard overrules."""
+    def act(self, observation: Observation, state: RuleState) -> tuple[Command, RuleState]:
+        """Engine follows the load above the threshold, else off; the guards overrule."""
         demand_w = observation.power_demand_w
         engage_soc = self.powertrain.battery.soc_min + self.guard_margin
         engaged = np.where(
-            state, observation.soc < engage_soc + self.guard_release, observation.soc < engage_soc
+            state.engaged,
+            observation.soc < engage_soc + self.guard_release,
+            observation.soc < engage_soc,
         )
-        guard = engaged & self.soc_guard
+        peak_w = recent_peak_w(self.powertrain, state.peak_w, demand_w)
+        discharge_w = observation.discharge_limit_w
+        hold = observation.engine_on & must_hold(self.powertrain, peak_w, discharge_w)
+        hold_w = np.where(hold, hold_power_w(self.powertrain, peak_w, discharge_w), 0.0)
         best_w = best_power_w(self.powertrain)
-        engine_w = np.where(demand_w > self.threshold_w, demand_w, 0.0)
-        engine_w = np.where(guard, np.maximum(demand_w, best_w), engine_w)
+        engine_w = np.where(demand_w > self.threshold_w, demand_w, hold_w)
+        engine_w = np.where(engaged & self.soc_guard, np.maximum(demand_w, best_w), engine_w)
         lb, ub = feasible_battery_power_w(limits_of(observation), demand_w)
-        return _command(project(demand_w - engine_w, lb, ub), engine_w <= 0.0), engaged
+        command = _command(project(demand_w - engine_w, lb, ub), engine_w <= 0.0)
+        return command, RuleState(engaged, peak_w)
 
 
 @dataclass(frozen=True)
