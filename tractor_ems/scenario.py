@@ -58,7 +58,7 @@ def make_scenario(
     if abs(duty_cycle.dt_s - params.dt_s) > 1e-9:
         raise CycleError(
             f"cycle {duty_cycle.name}: dt_s {duty_cycle.dt_s}, powertrain {params.name} "
-            f"steps by {params.dt_s} s"
+            f"steps by {params.dt_s} s (ems cycle import --dt {params.dt_s:g} resamples)"
         )
     initial = params.soc_initial if soc_initial is None else soc_initial
     default_target = initial if params.soc_target is None else params.soc_target

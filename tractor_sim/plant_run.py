@@ -165,7 +165,8 @@ def prepare_run(
     duty = load_cycle(cycle)
     if abs(duty.dt_s - params.dt_s) > 1e-9:
         raise CycleError(
-            f"cycle {duty.name}: dt_s {duty.dt_s}, powertrain {params.name} needs {params.dt_s}"
+            f"cycle {duty.name}: dt_s {duty.dt_s}, powertrain {params.name} needs {params.dt_s} "
+            f"(ems cycle import --dt {params.dt_s:g} resamples)"
         )
     initial = params.soc_initial if soc_initial == UNSET_SOC else soc_initial
     target = params.soc_target if soc_target == UNSET_SOC else soc_target

@@ -9,6 +9,7 @@ from tractor_ems.bags.in_process import record_in_process
 from tractor_ems.cli import main
 from tractor_ems.policies.rules import Conventional
 from tractor_ems.scenario import make_scenario
+from tractor_msgs_py.errors import CycleError
 from tractor_sim.duty_cycle.cycle import cycle_hash
 from tractor_sim.duty_cycle.cycle_csv import read_cycle_csv
 from tractor_sim.duty_cycle.library import load_cycle
@@ -70,6 +71,15 @@ def test_an_import_prints_its_account_and_writes_a_cycle_that_is_read_back(capsy
     cycle = read_cycle_csv(out)
     assert cycle.dt_s == 1.0
     np.testing.assert_allclose(cycle.power_demand_w, 1000 * (10 * np.arange(10) + 4.5))
+
+
+def test_a_ten_hertz_file_is_refused_with_the_way_out_and_driven_after_import(capsys, tmp_path):
+    source, out = tmp_path / "fast.csv", tmp_path / "cycle.csv"
+    source.write_text(HEAD + "".join(f"{k / 10:.1f},50000\n" for k in range(100)))
+    with pytest.raises(CycleError, match=r"dt_s 0.1.*ems cycle import --dt 1 "):
+        make_scenario("field", str(source))
+    document(capsys, "cycle", "import", source, "--out", out)
+    assert make_scenario("field", str(out)).cycle.power_demand_w.tolist() == [50e3] * 10
 
 
 def test_pieces_are_numbered_and_none_is_written_over_another_file(capsys, tmp_path):
