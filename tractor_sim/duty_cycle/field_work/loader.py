@@ -61,12 +61,14 @@ def _cycle(
     loaded = work.weight_kg + payload_kg
     dig_s = float(rng.uniform(*work.dig_s))
     dig_axle_w = float(rng.uniform(*work.dig_force_n)) * work.dig_speed_km_h / 3.6
-    # The bucket is crowded and curled in bursts while the wheels push.
-    bursts = rng.dirichlet(np.full(4, 8.0)) * 4.0
-    dig = [
-        (dig_s / 4, _bus_w(drive, dig_axle_w * (0.6 + 0.4 * b), tilt_w * b), 0.0)
-        for b in bursts.tolist()
-    ]
+    # The bucket is crowded and curled in bursts while the wheels push, gently at first; what
+    # exceeds the machine's power takes longer.
+    bursts = rng.dirichlet(np.full(4, 8.0)) * np.array([2.4, 4.0, 4.0, 4.0])
+    dig = []
+    for burst in bursts.tolist():
+        need_w = _bus_w(drive, dig_axle_w * (0.6 + 0.4 * burst), tilt_w * burst)
+        longer = max(1.0, need_w / work.power_max_w)
+        dig.append((dig_s / 4 * longer, need_w / longer, 0.0))
     return [
         *_leg(drive, work, work.weight_kg, place["approach"], speed(), 0.0),
         *dig,

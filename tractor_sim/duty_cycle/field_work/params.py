@@ -145,6 +145,7 @@ class Loader(_Strict):
     speed_up_m_per_s2: Positive
     rolling: Share
     dig_s: Range
+    power_max_w: Positive
     dig_force_n: Range
     dig_speed_km_h: Positive
     lift_height_m: Range

@@ -107,6 +107,8 @@ def draw_setup(
     units = float(rng.choice(work.units))
     drawn_depth = float(rng.uniform(*work.depth_cm)) if work.depth_cm else 1.0
     texture = str(rng.choice(work.textures))
+    if work.d497 is not None:
+        units = wider_in_light_soil(work, units, texture)
     speed = float(rng.uniform(*work.speed_km_h)) / 3.6
     numeric = float(rng.uniform(*work.wheel_numeric))
     crop = float(rng.uniform(*work.pto.crop_kg_per_m2)) if work.pto else 0.0
@@ -120,6 +122,13 @@ def draw_setup(
         wheel_numeric=numeric,
         crop_kg_per_m2=crop,
     )
+
+
+def wider_in_light_soil(work: FieldWork, units: float, texture: str) -> float:
+    """Width x F^-0.5: who farms sand buys a wider implement; whole tools (assumed)."""
+    assert work.d497 is not None
+    wider = units * draft_params(work.d497).texture_factor[texture] ** -0.5
+    return wider if work.unit_width_m == 1.0 else float(round(wider))
 
 
 def make_setup(
