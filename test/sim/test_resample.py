@@ -62,7 +62,7 @@ def test_energy_is_kept_up_to_the_last_part_of_a_step(seed, count, dt_s, usual_s
     assert 0 <= account.tail_dropped_s < dt_s * (1 + 1e-6)
     lost_j = np.abs(power_w).max() * account.tail_dropped_s
     expected_j = account.energy_before_j + account.energy_filled_j
-    assert abs(account.energy_after_j - expected_j) <= lost_j + 1e-3
+    assert abs(account.energy_after_j - expected_j) <= lost_j + 1e-3 * (1 + account.duration_s)
     assert account.energy_after_j == pytest.approx(demand_w.sum() * dt_s)
 
 

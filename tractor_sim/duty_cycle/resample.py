@@ -294,5 +294,6 @@ def _means(
     if steps == len(power_w) and np.allclose(time_s, dt_s * np.arange(steps), rtol=0, atol=1e-6):
         return power_w.copy(), 0.0  # already at the step: the same to the bit
     edge_s = np.minimum(dt_s * np.arange(steps + 1), end_s[-1])
-    demand_w = np.diff(np.interp(edge_s, end_s, energy_j)) / dt_s
+    # To the milliwatt: what is below it is rounding of the sum.
+    demand_w = np.round(np.diff(np.interp(edge_s, end_s, energy_j)) / dt_s, 3) + 0.0
     return demand_w, max(0.0, float(end_s[-1]) - steps * dt_s)
