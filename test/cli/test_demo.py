@@ -73,7 +73,9 @@ def test_its_bags_pass_every_check_and_its_training_names_them(demo):
     assert {bag["policy"] for bag in summary["bags"]} == {"dp", "rule_based"}
     for bag in summary["bags"]:
         assert bag["cycle"] in cycle_names("train")
-        assert check(out / bag["path"]).verdict == "pass"
+        report = check(out / bag["path"])
+        failed = [item for item in report.checks if item.outcome == "fail"]
+        assert report.verdict == "pass", (bag["path"], failed)
     for facts in summary["training"].values():
         assert len(facts["bags"]) == len(summary["bags"])
         assert (out / facts["policy"]).is_file()

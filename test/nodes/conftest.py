@@ -151,7 +151,7 @@ class Graph:
         return PlantSim(self.node("plant_sim"), {**defaults, "output": output, **values})
 
     def policy(self, answerer: Answerer, name: str = "test_policy") -> PolicyNode:
-        return PolicyNode(self.node(name), answerer)
+        return PolicyNode(self.node(name), answerer, history_depth=10)
 
     def peer(self, *heard: topics.Topic, name: str = "peer") -> Peer:
         return Peer(self.node(name), heard)

@@ -1,18 +1,21 @@
 """A run through separate processes: the same result, and no process left whatever happens."""
 
+import contextlib
 import os
 import signal
 import socket
 import subprocess
 import sys
+import threading
 
 import psutil
 import pytest
 
 from tractor_ems import ros_run
+from tractor_ems.bags.check import check
 from tractor_ems.drive import drive
 from tractor_ems.policies.rules import Conventional, RuleBased
-from tractor_ems.ros_run import DOMAIN_VARIABLE, run_ros
+from tractor_ems.ros_run import DOMAIN_VARIABLE, MODULES, run_ros
 from tractor_ems.scenario import make_scenario
 from tractor_msgs_py.errors import ConfigError, RunAborted
 from tractor_msgs_py.provenance import command_line
@@ -52,6 +55,32 @@ def test_recorded_run_equals_the_in_process_run_and_its_bag(scenario, tmp_path):
     assert [path.name for path in tmp_path.glob("*bag*")] == ["bag"]
     assert result.run["command_line"] == run.info.command_line == command_line()
     assert run.complete and run.policy == "conventional" and result.bag == tmp_path / "bag"
+
+
+@pytest.mark.slow
+def test_a_recorder_that_stands_still_for_a_while_loses_nothing(tmp_path):
+    stop, stood_still = threading.Event(), []
+
+    def hold_up() -> None:
+        while not stop.wait(0.2):
+            for child in psutil.Process().children():
+                with contextlib.suppress(psutil.Error):
+                    if MODULES["bag_recorder"] in child.cmdline():
+                        child.suspend()
+                        stop.wait(0.5)
+                        child.resume()
+                        stood_still.append(child.pid)
+
+    thread = threading.Thread(target=hold_up)
+    thread.start()
+    try:
+        run_ros(RULES, make_scenario("paper", "planter", 0.85, 0.836), record=tmp_path / "bag")
+    finally:
+        stop.set()
+        thread.join()
+    assert stood_still
+    report = check(tmp_path / "bag")
+    assert report.verdict == "pass", [item for item in report.checks if item.outcome == "fail"]
 
 
 @pytest.mark.slow

@@ -26,7 +26,7 @@ from tractor_msgs_py.errors import BagError
 from tractor_msgs_py.ros.diagnostics import PERIOD_S, diagnostic_array
 from tractor_msgs_py.ros.messages import RosMessages
 from tractor_msgs_py.ros.shell import Parameter, run_node
-from tractor_msgs_py.ros.wire import publish_on, subscribe_to
+from tractor_msgs_py.ros.wire import HISTORY_DEPTH, publish_on, subscribe_to
 from tractor_msgs_py.types import BatteryPowerCommand
 
 T = TypeVar("T")
@@ -41,6 +41,7 @@ COMMON = (
     Parameter(
         "observation_timeout_s", 2.0, "real time: fall back after silence of", "s", 0.01, 60
     ),
+    HISTORY_DEPTH,
 )
 
 
@@ -70,7 +71,8 @@ def run_policy_node(
         setup = prepare(values)
         made_for = None if values["allow_other_powertrain"] else setup.powertrain_hash
         timeout_s = values["observation_timeout_s"]
-        return PolicyNode(node, Answerer(setup.policy, made_for, timeout_s, setup.check_run))
+        answerer = Answerer(setup.policy, made_for, timeout_s, setup.check_run)
+        return PolicyNode(node, answerer, values["history_depth"])
 
     return run_node(name, (*parameters, *COMMON), build)
 
@@ -78,9 +80,9 @@ def run_policy_node(
 class PolicyNode:
     """Wires one ``Answerer`` to the topics."""
 
-    def __init__(self, node: Node, answerer: Answerer) -> None:
+    def __init__(self, node: Node, answerer: Answerer, history_depth: int) -> None:
         self._node, self._answerer, self._factory = node, answerer, RosMessages()
-        self._commands = publish_on(node, topics.COMMAND)
+        self._commands = publish_on(node, topics.COMMAND, history_depth)
         # run_info comes first: callbacks that are ready together run in the order of creation.
         subscribe_to(node, topics.RUN_INFO, self._on_run_info)
         for topic, decode in OBSERVED:

@@ -8,6 +8,7 @@ from typing import Any
 
 from tractor_msgs_py.errors import ConfigError
 from tractor_msgs_py.ros.shell import Parameter
+from tractor_msgs_py.ros.wire import HISTORY_DEPTH
 from tractor_sim.lockstep import Lockstep
 from tractor_sim.pace import Pace
 from tractor_sim.plant_run import UNSET_SOC, PlantRun
@@ -60,6 +61,7 @@ PARAMETERS = (
         "folder for trajectory.csv and result.json, empty for none; an old result is removed",
     ),
     Parameter("command_line", "", "what to record as the origin of the run, empty for its own"),
+    HISTORY_DEPTH,
 )
 
 

@@ -53,8 +53,9 @@ class PlantSim:
             clear_run(self._output)
         self._done_s: float | None = None
         self._code: int | None = None
-        sent = (topics.RUN_INFO, topics.POWER_DEMAND, topics.BATTERY, topics.POWERTRAIN)
-        self._publishers = {topic.name: publish_on(node, topic) for topic in sent}
+        self._publishers = {topics.RUN_INFO.name: publish_on(node, topics.RUN_INFO)}
+        for topic in (topics.POWER_DEMAND, topics.BATTERY, topics.POWERTRAIN):
+            self._publishers[topic.name] = publish_on(node, topic, values["history_depth"])
         self._commands = subscribe_to(node, topics.COMMAND, self._on_command)
         self._diagnostics = publish_on(node, topics.DIAGNOSTICS)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
