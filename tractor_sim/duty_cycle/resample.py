@@ -129,39 +129,10 @@ def resample(samples: Samples, settings: ImportSettings) -> tuple[list[FloatArra
             less than one step of time, or more steps than any work has; the message names the
             file, the row and the value.
     """
-    fault = _faults(samples, settings)
-    kept = np.flatnonzero(fault == 0)
-    first = _first_dropped(samples, fault)
-    total = len(samples.time_s)
-    if len(kept) < 2:
-        raise CycleError(
-            f"{samples.source}: {len(kept)} usable rows of {total}, at least 2 are needed to know "
-            f"the step{f' ({first})' if first else ''}"
-        )
-    if total - len(kept) > settings.max_dropped * total:
-        raise CycleError(
-            f"{samples.source}: {total - len(kept)} of {total} rows are unusable, allowed "
-            f"{settings.max_dropped:.0%} (first: {first})"
-        )
+    fault, kept = _usable(samples, settings)
     time_s = samples.time_s[kept] - samples.time_s[kept[0]]
     power_w = samples.power_demand_w[kept]
-    interval_s = np.diff(time_s)
-    usual_s = float(np.median(interval_s))
-    gap = interval_s > GAP * usual_s
-    too_long = gap & (interval_s > settings.max_gap_s)
-    if too_long.any() and not settings.split:
-        k = int(np.flatnonzero(too_long)[0])
-        raise CycleError(
-            f"{samples.source}: {samples.place_name} {samples.place[kept[k + 1]]}: gap of "
-            f"{interval_s[k]:.6g} s at {time_s[k]:.6g} s, filled are gaps up to "
-            f"{settings.max_gap_s:g} s (--max-gap-s; --split-gaps cuts the recording there)"
-        )
-    lasts_s = float(interval_s[~too_long].sum())
-    if lasts_s > MAX_STEPS * min(settings.dt_s, usual_s):
-        raise CycleError(
-            f"{samples.source}: lasts {lasts_s:.6g} s, allowed are {MAX_STEPS} steps of "
-            f"{settings.dt_s:g} s, and as many of its own {usual_s:.3g} s"
-        )
+    usual_s, gap, too_long = _gaps(samples, settings, kept, time_s)
     pieces, tails_s = [], 0.0
     before_j, filled_j, filled_s = 0.0, 0.0, 0.0
     edges = [0, *(np.flatnonzero(too_long) + 1).tolist(), len(time_s)]
@@ -183,18 +154,18 @@ def resample(samples: Samples, settings: ImportSettings) -> tuple[list[FloatArra
     steps = sum(map(len, pieces))
     short = gap & ~too_long
     return pieces, Account(
-        rows_read=total,
+        rows_read=len(samples.time_s),
         rows_kept=len(kept),
         dropped_not_a_number=int(np.sum(fault == 1)),
         dropped_absurd_power=int(np.sum(fault == 2)),
         dropped_duplicate_time=int(np.sum(fault == 3)),
         dropped_time_backwards=int(np.sum(fault == 4)),
-        first_dropped=first,
+        first_dropped=_first_dropped(samples, fault),
         refused=dict(samples.refused),
         usual_step_s=usual_s,
         gaps_filled=int(short.sum()),
         gap_filled_s=filled_s,
-        longest_gap_s=float(interval_s[short].max(initial=0.0)),
+        longest_gap_s=float(np.diff(time_s)[short].max(initial=0.0)),
         gaps_cut=int(too_long.sum()),
         tail_dropped_s=tails_s,
         energy_before_j=before_j,
@@ -203,6 +174,49 @@ def resample(samples: Samples, settings: ImportSettings) -> tuple[list[FloatArra
         duration_s=steps * settings.dt_s,
         steps=steps,
     )
+
+
+def _usable(samples: Samples, settings: ImportSettings) -> tuple[IntArray, IntArray]:
+    """Per row 0 or its fault, and the rows without one; refuses what is mostly faults."""
+    fault = _faults(samples, settings)
+    kept = np.flatnonzero(fault == 0)
+    first = _first_dropped(samples, fault)
+    total = len(samples.time_s)
+    if len(kept) < 2:
+        raise CycleError(
+            f"{samples.source}: {len(kept)} usable rows of {total}, at least 2 are needed to know "
+            f"the step{f' ({first})' if first else ''}"
+        )
+    if total - len(kept) > settings.max_dropped * total:
+        raise CycleError(
+            f"{samples.source}: {total - len(kept)} of {total} rows are unusable, allowed "
+            f"{settings.max_dropped:.0%} (--max-dropped; first: {first})"
+        )
+    return fault, kept
+
+
+def _gaps(
+    samples: Samples, settings: ImportSettings, kept: IntArray, time_s: FloatArray
+) -> tuple[float, BoolArray, BoolArray]:
+    """The usual interval, which intervals are gaps, and which of these too long to fill."""
+    interval_s = np.diff(time_s)
+    usual_s = float(np.median(interval_s))
+    gap = interval_s > GAP * usual_s
+    too_long = gap & (interval_s > settings.max_gap_s)
+    if too_long.any() and not settings.split:
+        k = int(np.flatnonzero(too_long)[0])
+        raise CycleError(
+            f"{samples.source}: {samples.place_name} {samples.place[kept[k + 1]]}: gap of "
+            f"{interval_s[k]:.6g} s at {time_s[k]:.6g} s, filled are gaps up to "
+            f"{settings.max_gap_s:g} s (--max-gap-s; --split-gaps cuts the recording there)"
+        )
+    lasts_s = float(interval_s[~too_long].sum())
+    if lasts_s > MAX_STEPS * min(settings.dt_s, usual_s):
+        raise CycleError(
+            f"{samples.source}: lasts {lasts_s:.6g} s, allowed are {MAX_STEPS} steps of "
+            f"{settings.dt_s:g} s, and as many of its own {usual_s:.3g} s"
+        )
+    return usual_s, gap, too_long
 
 
 _FAULTS = ("", "not a number", "absurd power", "time given before", "time runs backwards")
