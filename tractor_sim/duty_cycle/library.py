@@ -45,6 +45,7 @@ class _Family(BaseModel):
     turn_sd_w: Watt
     clip_min_w: Watt
     clip_max_w: Watt
+    start_max_w: Watt
 
 
 class _Planter(BaseModel):

@@ -24,6 +24,7 @@ class PlanterParams:
         turn_period_min_s, turn_period_max_s: one period per cycle, uniform in between [s].
         turn_mean_w, turn_sd_w: demand in a turn, normal [W].
         clip_min_w, clip_max_w: bounds of demand before scaling [W].
+        start_max_w: most demand in the first step, from standstill; the rest makes up for it [W].
     """
 
     duration_s: int
@@ -40,6 +41,7 @@ class PlanterParams:
     turn_sd_w: float
     clip_min_w: float
     clip_max_w: float
+    start_max_w: float = float("inf")
 
 
 def planter_demand_w(params: PlanterParams, seed: int) -> FloatArray:
@@ -58,4 +60,8 @@ def planter_demand_w(params: PlanterParams, seed: int) -> FloatArray:
     turn_w = rng.normal(params.turn_mean_w, params.turn_sd_w, steps)
     demand = np.clip(np.where(turning, turn_w, demand), params.clip_min_w, params.clip_max_w)
     scaled: FloatArray = demand * (params.mean_w / demand.mean())
+    if scaled[0] > params.start_max_w:
+        rest_j = params.mean_w * steps - params.start_max_w
+        scaled = demand * (rest_j / demand[1:].sum())
+        scaled[0] = params.start_max_w
     return scaled
