@@ -6,7 +6,7 @@ from tractor_ems.drive import drive
 from tractor_ems.optimal.score import dp_ratio
 from tractor_ems.policies.protocol import Policy
 from tractor_ems.policies.registry import make_policy, node_of
-from tractor_ems.result import Result, Transport, summarise
+from tractor_ems.result import NOT_ASKED_FOR, Result, Transport, summarise
 from tractor_ems.scenario import Scenario
 from tractor_msgs_py.errors import TractorEmsError
 from tractor_msgs_py.trajectory import Trajectory
@@ -20,6 +20,7 @@ def evaluate(
     record: Path | None = None,
     allow_other_powertrain: bool = False,
     soc_guard: bool = True,
+    with_dp: bool = True,
 ) -> tuple[Result, Trajectory]:
     """Drive and score.
 
@@ -31,6 +32,7 @@ def evaluate(
         record: folder of a new bag that receives the run; None records nothing.
         allow_other_powertrain: let a learned policy drive a powertrain it was not made for.
         soc_guard: of the rule base.
+        with_dp: solve for the matched-SOC DP ratio; without it a run takes a fraction of a second.
 
     Raises:
         TractorEmsError: bad input, or a run that was aborted.
@@ -43,7 +45,7 @@ def evaluate(
         made = None if policy == "dp" else make_policy(policy, scenario, **options)
         node = node_of(policy, scenario, **options)
         trajectory = run_ros(node, scenario, record=record).trajectory
-        return score(made or policy, scenario, trajectory, transport), trajectory
+        return score(made or policy, scenario, trajectory, transport, with_dp), trajectory
     made = make_policy(policy, scenario, **options)
     if record is not None:
         from tractor_ems.bags.in_process import record_in_process
@@ -57,31 +59,21 @@ def evaluate(
             scenario.soc_initial,
             scenario.soc_target,
         )[0]
-    return score(made, scenario, trajectory, transport), trajectory
+    return score(made, scenario, trajectory, transport, with_dp), trajectory
 
 
 def score(
-    policy: Policy | str, scenario: Scenario, trajectory: Trajectory, transport: Transport
+    policy: Policy | str,
+    scenario: Scenario,
+    trajectory: Trajectory,
+    transport: Transport,
+    with_dp: bool = True,
 ) -> Result:
     """The result row of a finished run, with its matched-SOC DP ratio.
 
     A run that was driven is reported even where DP cannot judge it; ``dp_note`` says why.
     """
-    shortfall_j = float(trajectory.shortfall_j.sum())
-    ratio, note = None, None
-    try:
-        ratio = dp_ratio(
-            scenario.params,
-            trajectory.power_demand_w,
-            float(trajectory.soc[0]),
-            trajectory.soc_final,
-            float(trajectory.fuel_kg.sum()),
-            shortfall_j=shortfall_j,
-        )
-        if shortfall_j > 0.0:
-            note = f"shortfall of {shortfall_j:.0f} J: undelivered work does not score"
-    except TractorEmsError as error:
-        note = str(error)
+    ratio, note = _ratio(scenario, trajectory) if with_dp else (None, NOT_ASKED_FOR)
     return summarise(
         trajectory,
         policy=policy if isinstance(policy, str) else policy.name,
@@ -93,3 +85,21 @@ def score(
         dp_note=note,
         trained_on=getattr(policy, "metadata", {}).get("cycle_hashes", ()),
     )
+
+
+def _ratio(scenario: Scenario, trajectory: Trajectory) -> tuple[float | None, str | None]:
+    """The DP ratio, or None and why there is none."""
+    shortfall_j = float(trajectory.shortfall_j.sum())
+    if shortfall_j > 0.0:
+        return None, f"shortfall of {shortfall_j:.0f} J: undelivered work does not score"
+    try:
+        ratio = dp_ratio(
+            scenario.params,
+            trajectory.power_demand_w,
+            float(trajectory.soc[0]),
+            trajectory.soc_final,
+            float(trajectory.fuel_kg.sum()),
+        )
+    except TractorEmsError as error:
+        return None, str(error)
+    return ratio, None

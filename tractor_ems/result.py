@@ -19,6 +19,9 @@ Transport = Literal["in_process", "ros"]
 UNSEEN = ("validation", "held_out")
 """Splits that no policy learns from."""
 
+NOT_ASKED_FOR = "not asked for"
+"""``dp_note`` of a run that was not to be scored."""
+
 POWER_TOLERANCE_W = 1e-3
 SOC_TOLERANCE = 1e-9
 CURRENT_TOLERANCE_A = 1e-3

@@ -12,7 +12,7 @@ from tractor_ems.policies.protocol import limits_of
 from tractor_ems.policies.reserve import beyond_battery_w, hold_power_w, must_hold, recent_peak_w
 from tractor_msgs_py.errors import PolicyError
 from tractor_msgs_py.observation import DemandFilter, Observation, ObservationSpec
-from tractor_msgs_py.trajectory import FloatArray
+from tractor_msgs_py.trajectory import BoolArray, FloatArray
 from tractor_sim.powertrain import (
     Command,
     PowertrainParams,
@@ -22,18 +22,28 @@ from tractor_sim.powertrain import (
 
 
 @dataclass(frozen=True)
+class LevellingState:
+    """Memory of load levelling, each of shape (B,): whether the engine is in a stretch of running,
+    and the recent peak demand [W]."""
+
+    working: BoolArray
+    peak_w: FloatArray
+
+
+@dataclass(frozen=True)
 class LoadLevelling:
     """The engine gives what the work needs on average and what brings SOC back to its target:
 
         P = mean(P_dem) + E (SOC_target - SOC) / soc_time_s
 
-    A running engine gives ``max(P, least_share P_max)`` and stops when P falls to
-    ``stop_share P_max``; a stopped one starts when P reaches ``start_share P_max``. P_max is
-    the engine's most at the bus. In heavy work P stays high and the engine never stops. In light
-    work the engine gives more than the mean, SOC rises until P falls to the stop, and SOC swings
-    by ``(start_share - stop_share) P_max soc_time_s / E``: 0.11 on "field". Where an
-    engine is not back at once (see ``reserve``) it is started for demand that the battery should
-    not carry alone, and held, idling where P is none, while such peaks are recent.
+    A stretch of running begins when P exceeds ``start_share P_max`` (P_max is the engine's most
+    at the bus) and ends when P is down to ``stop_share P_max``; during it the engine gives
+    ``max(P, least_share P_max)``. In heavy work P stays high and the stretch lasts. In light work
+    the engine gives more than the mean, SOC rises until the stretch ends, and it swings by about
+    ``(start_share - stop_share) P_max soc_time_s / E``: 0.11 on "field".
+
+    Where an engine is not back at once (see ``reserve``) it also runs for demand that the battery
+    should not carry alone, and while such peaks are recent it is held: at P, idling if need be.
 
     Attributes:
         powertrain: what it drives.
@@ -70,27 +80,31 @@ class LoadLevelling:
         """The slow mean comes as the observation's only feature."""
         return ObservationSpec(filters=(DemandFilter("low_pass", self.mean_time_s),))
 
-    def init(self, batch: int) -> FloatArray:
-        """No peak seen, shape (B,). The mean is observed, and so is whether the engine runs."""
-        return np.zeros(batch)
+    def init(self, batch: int) -> LevellingState:
+        """Not running, no peak seen; the mean is observed."""
+        return LevellingState(np.zeros(batch, dtype=bool), np.zeros(batch))
 
-    def act(self, observation: Observation, state: FloatArray) -> tuple[Command, FloatArray]:
+    def act(
+        self, observation: Observation, state: LevellingState
+    ) -> tuple[Command, LevellingState]:
         """Engine at the level or off; both projected on what the battery allows."""
         most_w = power_max_w(self.powertrain)
         gain_w = self.powertrain.battery.energy_j / self.soc_time_s
         level_w = observation.features[:, 0] + gain_w * (observation.soc_target - observation.soc)
         demand_w = observation.power_demand_w
-        peak_w = recent_peak_w(self.powertrain, state, demand_w)
         discharge_w = observation.discharge_limit_w
+        peak_w = recent_peak_w(self.powertrain, state.peak_w, demand_w)
         needed_w = beyond_battery_w(self.powertrain, demand_w, discharge_w)
-        wanted = level_w > np.where(
-            observation.engine_on, self.stop_share * most_w, self.start_share * most_w
+        # Remembered, not read off the engine: an engine that is only held must not be taken for
+        # one in a stretch, or it would change between idling and the least power each second.
+        working = level_w > np.where(
+            state.working, self.stop_share * most_w, self.start_share * most_w
         )
         held = observation.engine_on & must_hold(self.powertrain, peak_w, discharge_w)
-        run = wanted | held | (needed_w > 0.0)
-        least_w = np.where(wanted, self.least_share * most_w, 0.0)
+        run = working | held | (needed_w > 0.0)
+        least_w = np.where(working, self.least_share * most_w, 0.0)
         hold_w = hold_power_w(self.powertrain, peak_w, discharge_w)
         engine_w = np.maximum.reduce([level_w, least_w, needed_w, hold_w])
         lb, ub = feasible_battery_power_w(limits_of(observation), demand_w)
         battery_w = project(np.where(run, demand_w - engine_w, demand_w), lb, ub)
-        return Command(battery_w, np.where(run, np.nan, 0.0)), peak_w
+        return Command(battery_w, np.where(run, np.nan, 0.0)), LevellingState(working, peak_w)
