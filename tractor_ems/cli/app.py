@@ -2,7 +2,7 @@
 
 import typer
 
-from tractor_ems.cli import bag, cycle, demo, dp, evaluate, study, train
+from tractor_ems.cli import bag, cycle, demo, dp, evaluate, study, train, vehicle
 
 app = typer.Typer(
     name="ems",
@@ -19,3 +19,4 @@ app.command("dp")(dp.dp)
 app.add_typer(cycle.app, name="cycle")
 app.add_typer(bag.app, name="bag")
 app.add_typer(study.app, name="study")
+app.add_typer(vehicle.app, name="vehicle")
