@@ -28,7 +28,7 @@ def draw_job(
     for start, end, height, whole in _stretches(rng, job, duration_s):
         if start > duration_s:
             break
-        onset = start + rng.normal(*job.onset_s)
+        onset = start + (rng.normal(*job.onset_s) if whole else 0.0)
         release = end + rng.normal(*job.end_lag_s)
         if whole and rng.random() < job.late_chance:
             late_s = rng.uniform(*job.late_s)
@@ -45,7 +45,7 @@ def draw_job(
     for start, end in zip(turn_starts, turn_ends, strict=True):
         inside = (time_s >= start - 10) & (time_s < end + 10)
         along = np.clip((time_s[inside] - start) / min(max(end - start, 1.0), 60.0), 0.0, 1.0)
-        turning[inside] = np.interp(along, (0.0, 0.5, 1.0), job.turn_level)
+        turning[inside] = np.interp(along, (0.0, 0.35, 1.0), job.turn_level)
         if end - start > job.piece_gap_s[1]:
             idle |= (time_s >= start + 25.0) & (time_s < end - 32.0)
     noise = job.noise_sd * autoregressive(rng, duration_s, job.noise_lag1)
