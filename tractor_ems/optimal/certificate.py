@@ -12,6 +12,7 @@ from tractor_ems.optimal.dp import (
     reachable_soc,
     solve,
 )
+from tractor_ems.optimal.engine_dp import has_engine_state, nearest_end_soc
 from tractor_ems.optimal.rollout import roll_out
 from tractor_msgs_py.errors import ConfigError
 from tractor_msgs_py.trajectory import FloatArray, Trajectory
@@ -25,6 +26,9 @@ ROLLOUT_LIMIT = 1e-3
 
 RESIDUAL_LIMIT = 2e-4
 """Largest priced energy missing at the end of the roll-out, relative to its fuel."""
+
+BRACKET_LIMIT = 5e-3
+"""Largest distance of a run of the real plant from the lower bound, relative to that."""
 
 NEGLIGIBLE_KG = 1e-4
 """Fuel below which the three limits are absolute, in parts of this mass: a tenth of a gram."""
@@ -48,20 +52,29 @@ class Certificate:
             roll-out gets right long before.)
         rollout_gap: (roll-out - V) / V, the roll-out with its residual priced.
         residual: priced energy missing at the end of the roll-out, relative to its fuel.
-        soc_points, actions: the finer grid.
-        fuel_kg: fuel of the roll-out on the real plant, its residual priced at the co-state.
+        bracket_width: (a run of the real plant - fuel_kg) / fuel_kg, the run's residual priced.
+            Where the plant has no engine state that run is the roll-out, set against V. None
+            where it was not asked for.
+        soc_points, actions: the finer grid; with engine state the nodes that the whole window
+            would have, and engine powers as far apart as the nodes.
+        fuel_kg: the reference of the score: fuel of the roll-out on the real plant, its residual
+            priced at the co-state; with engine state the lower bound.
         soc_initial, soc_final: where the roll-out starts and really ends.
-        ok: all three within their limits.
+        starts, stops: of the engine in the optimum.
+        ok: all of them within their limits.
     """
 
     grid_halving_change: float
     rollout_gap: float
     residual: float
+    bracket_width: float | None
     soc_points: int
     actions: int
     fuel_kg: float
     soc_initial: float
     soc_final: float
+    starts: int
+    stops: int
     ok: bool
 
     def to_json(self) -> dict[str, Any]:
@@ -77,18 +90,25 @@ def certify(
     *,
     soc_points: int = 401,
     actions: int = 1600,
+    bracket: bool = True,
 ) -> Certificate:
     """Solve and roll out on ever finer grids until the result stands.
 
     Args:
         power_demand_w: (T,), demand at the bus, auxiliaries included [W].
         soc_initial, soc_final: both within the battery's window; float32 rounding is forgiven.
-        soc_points, actions: the coarsest grid; refined as far as :data:`MAX_NODES` allows.
+        soc_points, actions: the coarsest grid; refined as far as :data:`MAX_NODES` allows. A
+            plant with engine state has grids of its own.
+        bracket: with engine state, also drive the real plant.
 
     Raises:
         ConfigError: a SOC is outside the window, or soc_final cannot be reached on this cycle.
     """
     start, end = checked_soc(params, power_demand_w, soc_initial, soc_final)
+    if has_engine_state(params):
+        from tractor_ems.optimal.engine_certificate import certify_engine
+
+        return certify_engine(params, power_demand_w, start, end, bracket=bracket)[0]
     coarse = solve(
         params, power_demand_w, end, soc_initial=start, soc_points=soc_points, actions=actions
     )
@@ -119,15 +139,19 @@ def _compare(
         change = abs(cost_kg - _priced(params, coarse, roll_out(coarse, params))[2]) / scale_kg
     gap = (cost_kg - value_kg) / scale_kg
     residual = residual_kg / max(fuel_kg, NEGLIGIBLE_KG)
+    on = run.engine_on
     return Certificate(
         grid_halving_change=change,
         rollout_gap=gap,
         residual=residual,
+        bracket_width=max(gap, 0.0),
         soc_points=fine.soc_points,
         actions=fine.actions,
         fuel_kg=fuel_kg,
         soc_initial=soc_initial,
         soc_final=run.soc_final,
+        starts=int(np.sum(on & ~np.append(False, on[:-1]))),
+        stops=int(np.sum(on[:-1] & ~on[1:])),
         ok=change < HALVING_LIMIT and abs(gap) < ROLLOUT_LIMIT and residual < RESIDUAL_LIMIT,
     )
 
@@ -159,10 +183,19 @@ def checked_soc(
         if not abs(given - inside) <= SOC_TOLERANCE:
             raise ConfigError(f"{name}: {given}, allowed {battery.soc_min}..{battery.soc_max}")
     start, end = float(clipped[0]), float(clipped[1])
-    nearest = float(reachable_soc(params, power_demand_w, start, end)[1][-1])
+    nearest = nearest_soc(params, power_demand_w, start, end)
     if abs(end - nearest) > SOC_TOLERANCE:
         raise ConfigError(
             f"soc_final: {soc_final} cannot be reached from {soc_initial} on this cycle, "
             f"the nearest is {nearest}"
         )
     return start, nearest
+
+
+def nearest_soc(
+    params: PowertrainParams, power_demand_w: FloatArray, soc_initial: float, soc_final: float
+) -> float:
+    """The SOC nearest to ``soc_final`` that a run from ``soc_initial`` can end at."""
+    if has_engine_state(params):
+        return nearest_end_soc(params, power_demand_w, soc_initial, soc_final)
+    return float(reachable_soc(params, power_demand_w, soc_initial, soc_final)[1][-1])

@@ -1,7 +1,7 @@
 """Backward dynamic programme over SOC: least fuel for a known cycle that ends at a target SOC.
 
-For a powertrain without engine memory (no start fuel, minimum times or ramp limit). What it
-drives on the real plant is ``rollout``; whether a grid is fine enough is ``certificate``.
+For a powertrain without engine memory (no start fuel, minimum times or ramp limit) and battery
+losses; any other is ``engine_dp``'s. What it drives on the real plant is ``rollout``; whether a grid is fine enough is ``certificate``.
 """
 
 import math
@@ -209,6 +209,11 @@ def check_problem(
                 f"powertrain {params.name}: engine.{name} is {value}, dynamic programming "
                 f"allows {free} (it has no engine state)"
             )
+    if not battery.lossless:
+        raise ConfigError(
+            f"powertrain {params.name}: battery has losses or current limits, this dynamic "
+            "programme knows none"
+        )
     for name, soc in (("soc_target", soc_target), ("soc_initial", soc_initial)):
         if soc is not None and not battery.soc_min <= soc <= battery.soc_max:
             raise ConfigError(f"{name}: {soc}, allowed {battery.soc_min}..{battery.soc_max}")

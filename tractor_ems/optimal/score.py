@@ -22,14 +22,17 @@ def dp_ratio(
     """The matched-SOC DP ratio of one run, at most 1 up to grid error.
 
     Solves for the run's own start and final SOC on a grid that a certificate chooses; nothing is
-    interpolated over final SOC, and no linear SOC correction is made.
+    interpolated over final SOC, and no linear SOC correction is made. With engine state the
+    reference is the lower bound, which no run of the plant can beat; the bracket, which says how
+    much too hard that may be, is not part of it.
 
     Args:
         power_demand_w: (T,), demand at the bus that the run drove, auxiliaries included [W].
         soc_initial, soc_final: of the run.
         run_fuel_kg: what it burnt; a run that burnt nothing cannot be beaten and scores 1.
         shortfall_j: demand it left unmet.
-        soc_points, actions: the coarsest grid the certificate may choose.
+        soc_points, actions: the coarsest grid the certificate may choose; a plant with engine
+            state has grids of its own.
 
     Returns:
         The ratio, or None where the run had shortfall: undelivered work must not score.
@@ -46,7 +49,13 @@ def dp_ratio(
     if run_fuel_kg == 0.0:
         return 1.0
     certificate = certify(
-        params, power_demand_w, soc_initial, soc_final, soc_points=soc_points, actions=actions
+        params,
+        power_demand_w,
+        soc_initial,
+        soc_final,
+        soc_points=soc_points,
+        actions=actions,
+        bracket=False,
     )
     if not certificate.ok:
         raise TractorEmsError(

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from tractor_ems.optimal.bracket import plan_policy
 from tractor_ems.optimal.dp import (
     DpSolution,
     cost_to_go_kg,
@@ -16,6 +17,9 @@ from tractor_ems.optimal.dp import (
     landing_power_w,
     solve,
 )
+from tractor_ems.optimal.engine_dp import has_engine_state, solve_engine
+from tractor_ems.policies.cycle_tick import tick_of
+from tractor_ems.policies.planned import PlannedPolicy
 from tractor_ems.policies.protocol import limits_of
 from tractor_msgs_py.codec import wire_soc
 from tractor_msgs_py.errors import PolicyError, RunAborted
@@ -23,7 +27,6 @@ from tractor_msgs_py.observation import Observation, ObservationSpec
 from tractor_msgs_py.trajectory import FloatArray
 from tractor_sim.battery import soc_after
 from tractor_sim.powertrain import (
-    ROUNDING_W,
     Command,
     PowertrainParams,
     battery_power_grid_w,
@@ -91,7 +94,7 @@ class DpPolicy:
         """
         params, solution = self.params, self.solution
         t0_ns = observation.stamp_ns if state.t0_ns is None else state.t0_ns
-        k = self._tick(observation, t0_ns)
+        k = tick_of(solution.power_demand_w, observation, t0_ns, params.dt_s)
         soc = observation.soc
         if state.soc is not None:
             soc = np.where(wire_soc(state.soc) == soc, state.soc, soc)
@@ -124,22 +127,6 @@ class DpPolicy:
     def _grid_w(self) -> FloatArray:
         return battery_power_grid_w(self.params, self.solution.actions)
 
-    def _tick(self, observation: Observation, t0_ns: int) -> int:
-        solved_w = self.solution.power_demand_w
-        k, rest = divmod(observation.stamp_ns - t0_ns, round(self.params.dt_s * 1e9))
-        if rest or not 0 <= k < len(solved_w):
-            raise RunAborted(
-                f"dp: stamp {observation.stamp_ns} ns is tick {k} and {rest} ns, "
-                f"the solved cycle has ticks 0..{len(solved_w) - 1} from {t0_ns} ns"
-            )
-        differs = ~(np.abs(observation.power_demand_w - solved_w[k]) <= ROUNDING_W)
-        if differs.any():
-            seen_w = observation.power_demand_w[np.argmax(differs)]
-            raise RunAborted(
-                f"dp: tick {k}: power_demand is {seen_w} W, the solved cycle has {solved_w[k]} W"
-            )
-        return k
-
     def _check_soc(self, k: int, soc: FloatArray) -> None:
         battery, row = self.params.battery, self.solution.soc_grid[k]
         step = battery.power_max_w * self.params.dt_s / battery.energy_j
@@ -154,8 +141,11 @@ class DpPolicy:
 
 def solve_policy(
     params: PowertrainParams, cycle_demand_w: FloatArray, soc_initial: float, soc_target: float
-) -> DpPolicy:
+) -> DpPolicy | PlannedPolicy:
     """The policy of a cycle from one SOC to another; ``cycle_demand_w`` (T,) as it appears at the
-    bus, auxiliaries included [W]. Raises what :func:`tractor_ems.optimal.dp.solve` raises."""
+    bus, auxiliaries included [W]. On a plant with engine state it drives the run that the bracket
+    of the certificate is about. Raises what ``dp.solve`` or ``engine_dp.solve_engine`` raise."""
+    if has_engine_state(params):
+        return plan_policy(params, solve_engine(params, cycle_demand_w, soc_initial, soc_target))
     solution = solve(params, cycle_demand_w, soc_target, soc_initial=soc_initial)
     return DpPolicy(params, solution)

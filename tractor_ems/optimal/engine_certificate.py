@@ -1,0 +1,85 @@
+"""The certificate of a plant with engine state: grid halving, roll-out on the relaxed plant, and
+the bracket between that and what the real plant can drive."""
+
+import numpy as np
+
+from tractor_ems.optimal.bracket import drive_plan
+from tractor_ems.optimal.certificate import (
+    BRACKET_LIMIT,
+    HALVING_LIMIT,
+    NEGLIGIBLE_KG,
+    RESIDUAL_LIMIT,
+    ROLLOUT_LIMIT,
+    Certificate,
+)
+from tractor_ems.optimal.engine_dp import EngineSolution, solve_engine
+from tractor_msgs_py.trajectory import FloatArray
+from tractor_sim.powertrain import PowertrainParams
+
+COARSE_CELL_J = 160e3
+"""First-pass cell of the coarser solution; the certificate is about the one with half of it."""
+
+FINEST_CELL_J = 10e3
+"""Refinement ends here."""
+
+
+def certify_engine(
+    params: PowertrainParams,
+    power_demand_w: FloatArray,
+    soc_initial: float,
+    soc_final: float,
+    *,
+    bracket: bool,
+) -> tuple[Certificate, EngineSolution]:
+    """Solve on ever finer grids until the result stands; both SOC checked by the caller.
+
+    ``bracket``: also drive the real plant and report the width; without it that is None.
+    """
+    cell_j = COARSE_CELL_J
+    coarse = solve_engine(params, power_demand_w, soc_initial, soc_final, cell_j=cell_j)
+    while True:
+        cell_j = 0.5 * cell_j
+        fine = solve_engine(params, power_demand_w, soc_initial, soc_final, cell_j=cell_j)
+        scale_kg = max(fine.lower_bound_kg, NEGLIGIBLE_KG)
+        change = abs(fine.lower_bound_kg - coarse.lower_bound_kg) / scale_kg
+        gap = (fine.cost_kg - fine.value_kg) / scale_kg
+        residual = _residual_kg(params, fine, fine.plan.soc[-1]) / scale_kg
+        stands = change < HALVING_LIMIT and abs(gap) < ROLLOUT_LIMIT and residual < RESIDUAL_LIMIT
+        if stands or 0.5 * cell_j < FINEST_CELL_J:
+            break
+        coarse = fine
+    width = bracket_width(params, fine) if bracket else None
+    window = params.battery.soc_max - params.battery.soc_min
+    certificate = Certificate(
+        grid_halving_change=change,
+        rollout_gap=gap,
+        residual=residual,
+        bracket_width=width,
+        soc_points=round(window * params.battery.energy_j / fine.cell_j) + 1,
+        actions=round(params.engine.power_max_w * params.dt_s / fine.cell_j) + 1,
+        fuel_kg=fine.lower_bound_kg,
+        soc_initial=soc_initial,
+        soc_final=float(fine.plan.soc[-1]),
+        starts=fine.plan.starts,
+        stops=fine.plan.stops,
+        ok=stands and (width is None or width <= BRACKET_LIMIT),
+    )
+    return certificate, fine
+
+
+def bracket_width(params: PowertrainParams, solution: EngineSolution) -> float:
+    """(Fuel of the best known run of the real plant - lower bound) / lower bound; energy missing
+    at its end is priced at the co-state, shortfall makes it infinite."""
+    run = drive_plan(params, solution)
+    if run.shortfall_j.sum() > solution.plan.shortfall_j.sum():
+        return float("inf")
+    upper_kg = float(run.fuel_kg.sum()) + _residual_kg(params, solution, run.soc_final)
+    lower_kg = solution.lower_bound_kg
+    return (upper_kg - lower_kg) / max(lower_kg, NEGLIGIBLE_KG)
+
+
+def _residual_kg(params: PowertrainParams, solution: EngineSolution, soc_final: float) -> float:
+    if solution.soc_target is None:
+        return 0.0
+    missing_j = max(solution.soc_target - soc_final, 0.0) * params.battery.energy_j
+    return float(missing_j * np.median(solution.co_state_kg_per_j))
