@@ -5,12 +5,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from tractor_msgs_py.errors import CycleError
+from tractor_msgs_py.errors import ConfigError, CycleError
 from tractor_sim.duty_cycle.cycle import cycle_hash
+from tractor_sim.duty_cycle.field_work import params
 from tractor_sim.duty_cycle.field_work.limits import highest_window_mean_w
 from tractor_sim.duty_cycle.field_work.params import FieldWork, operations
 from tractor_sim.duty_cycle.field_work.statistics import pass_bounds
 from tractor_sim.duty_cycle.generate import MEASURED_JOBS, OPERATIONS, generate, work_of
+from tractor_sim.resources import resource_path
 
 NAMES = OPERATIONS + MEASURED_JOBS
 # What "field" delivers: about 249 kW of engine at the bus after auxiliaries, 150 kW of battery.
@@ -165,3 +167,23 @@ def test_bad_arguments_name_what_is_allowed(arguments, message):
     given = {"operation": "chisel_plow", "seed": 1, **arguments}
     with pytest.raises(CycleError, match=message):
         generate(given.pop("operation"), given.pop("seed"), **given)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("    d497: rotary_hoe\n", "    d497: spade\n", r"rotary_hoe.d497: 'spade'.*tandem"),
+        ("  rated_power_w: 275.0e+3", "  rated_power_w: -1.0", r"rated_power_w.*-1"),
+        ("    grade_max: 0.05\n", "    grade_maximum: 0.05\n", r"grade_max"),
+        ("operations: [loader]", "operations: [mixed_day]", r"mixed_day.parts: 'mixed_day'"),
+        ("motor_load_fraction: [0.0,", "motor_load_fraction: [", r"motor curve"),
+    ],
+)
+def test_a_wrong_setting_is_refused_by_name(tmp_path, monkeypatch, old, new, message):
+    text = resource_path("config", "cycle", "operations.yaml").read_text()
+    assert old in text
+    path = tmp_path / "operations.yaml"
+    path.write_text(text.replace(old, new))
+    monkeypatch.setattr(params, "resource_path", lambda *parts: path)
+    with pytest.raises(ConfigError, match=message):
+        operations.__wrapped__()

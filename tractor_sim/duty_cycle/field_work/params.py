@@ -1,13 +1,14 @@
 """Schema of config/cycle/operations.yaml: every number of the generator, checked on reading."""
 
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from tractor_msgs_py.errors import ConfigError
 from tractor_sim.config import describe
-from tractor_sim.duty_cycle.field_work.draft import draft_params
+from tractor_sim.duty_cycle.field_work.draft import draft_table
 from tractor_sim.resources import resource_path
 from tractor_sim.yaml_file import read_yaml
 
@@ -27,6 +28,9 @@ def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
 
 Range = Annotated[tuple[NotNegative, NotNegative], AfterValidator(_ordered)]
 """Lowest and highest of a uniform draw."""
+
+
+PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(_ordered)]
 
 
 class _Strict(BaseModel):
@@ -53,13 +57,20 @@ class Vehicle(_Strict):
     mean_max_w: Positive
     mean_window_s: Annotated[int, Field(ge=1)]
 
+    @model_validator(mode="after")
+    def _curve_has_pairs(self) -> "Vehicle":
+        load, efficiency = self.motor_load_fraction, self.motor_efficiency
+        if len(load) != len(efficiency) or len(load) < 2 or list(load) != sorted(set(load)):
+            raise ValueError("motor curve: two or more pairs, load_fraction increasing")
+        return self
+
 
 class Turn(_Strict):
     """Headland turns."""
 
-    duration_s: Range
+    duration_s: PositiveRange
     duration_sd_s: NotNegative
-    speed_km_h: Range
+    speed_km_h: PositiveRange
     hydraulic_w: NotNegative
     steering_w: NotNegative
     noise_sd: NotNegative
@@ -99,7 +110,7 @@ class Pto(_Strict):
 class Plunger(_Strict):
     """Strokes of a baler: power swings by ``swing`` of the crop power at ``frequency_hz``."""
 
-    frequency_hz: Range
+    frequency_hz: PositiveRange
     swing: NotNegative
 
 
@@ -108,19 +119,19 @@ class FieldWork(_Strict):
 
     kind: Literal["field"]
     d497: str | None = None
-    units: tuple[Positive, ...]
+    units: Annotated[tuple[Positive, ...], Field(min_length=1)]
     unit_width_m: Positive
     overlap: Share
-    speed_km_h: Range
+    speed_km_h: PositiveRange
     depth_cm: Range | None = None
     depth_allowed_cm: Range | None = None
-    textures: tuple[Texture, ...] = ("medium",)
-    wheel_numeric: Range
+    textures: Annotated[tuple[Texture, ...], Field(min_length=1)] = ("medium",)
+    wheel_numeric: PositiveRange
     ballast_kg: Annotated[float, Field(ge=-5e3, le=2e4)]
     implement_kg: NotNegative
     cart_kg: NotNegative = 0.0
     rolling: Share
-    field_length_m: Range
+    field_length_m: PositiveRange
     grade_max: Annotated[float, Field(ge=0, le=0.3)]
     soil_sd: NotNegative
     soil_patch_m: Positive
@@ -139,12 +150,12 @@ class Loader(_Strict):
     kind: Literal["loader"]
     weight_kg: Positive
     payload_kg: Range
-    approach_m: Range
-    haul_m: Range
-    speed_km_h: Range
+    approach_m: PositiveRange
+    haul_m: PositiveRange
+    speed_km_h: PositiveRange
     speed_up_m_per_s2: Positive
     rolling: Share
-    dig_s: Range
+    dig_s: PositiveRange
     power_max_w: Positive
     dig_force_n: Range
     dig_speed_km_h: Positive
@@ -164,9 +175,9 @@ class Road(_Strict):
     """Transport with a trailer."""
 
     kind: Literal["road"]
-    weight_kg: Range
-    speed_km_h: Range
-    section_m: Range
+    weight_kg: PositiveRange
+    speed_km_h: PositiveRange
+    section_m: PositiveRange
     stop_chance: Share
     stop_s: Range
     rolling: Share
@@ -174,7 +185,7 @@ class Road(_Strict):
     speed_up_m_per_s2: Positive
     slow_down_m_per_s2: Positive
     grade_max: Annotated[float, Field(ge=0, le=0.15)]
-    wave_m: Range
+    wave_m: PositiveRange
     idle_w: NotNegative
     noise_sd: NotNegative
     noise_lag1: Lag1
@@ -211,8 +222,8 @@ class MeasuredJob(_Strict):
     onset_s: tuple[float, NotNegative]
     late_chance: Share
     late_s: Range
-    rise_per_s: Range
-    fall_per_s: Range
+    rise_per_s: PositiveRange
+    fall_per_s: PositiveRange
     end_lag_s: tuple[float, NotNegative]
     turn_level: tuple[Share, Share, Share]
     turn_noise_sd: NotNegative
@@ -251,9 +262,18 @@ def operations() -> Operations:
     except ValidationError as error:
         raise ConfigError(f"{path}: {describe(error)}") from None
     for name, work in checked.operations.items():
-        if isinstance(work, FieldWork) and work.d497 is not None:
-            try:
-                draft_params(work.d497)
-            except ConfigError as error:
-                raise ConfigError(f"{path}: operations.{name}.{error}") from None
+        problem = _unknown_name(work, checked.operations)
+        if problem is not None:
+            raise ConfigError(f"{path}: operations.{name}.{problem}")
     return checked
+
+
+def _unknown_name(work: object, known: Mapping[str, object]) -> str | None:
+    """What a piece of work refers to and is not there, in words."""
+    if isinstance(work, FieldWork) and work.d497 is not None and work.d497 not in draft_table():
+        return f"d497: {work.d497!r} is not in the table, one of {', '.join(draft_table())}"
+    if isinstance(work, Mixed):
+        for name in (name for part in work.parts for name in part.operations):
+            if name not in known or isinstance(known[name], Mixed):
+                return f"parts: {name!r} is no single operation of this file"
+    return None
