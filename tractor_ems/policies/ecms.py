@@ -3,6 +3,7 @@ price of battery energy that SOC corrects. Needs no future.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -27,6 +28,12 @@ from tractor_sim.powertrain import (
 
 GRID = 257
 """Engine powers tried besides the knots of the fuel curve: one per kW on "field"."""
+
+
+@lru_cache(maxsize=32)
+def _candidates_w(params: PowertrainParams) -> FloatArray:
+    grid_w = np.linspace(HOLD_ON_W, power_max_w(params), GRID)
+    return np.union1d(grid_w, power_knots_w(params)[1:])
 
 
 @dataclass(frozen=True)
@@ -76,7 +83,7 @@ class NeverStopEcms:
         price = self.equivalence * (1.0 + self.soc_gain * (observation.soc_target - soc))
         lb, ub = feasible_battery_power_w(limits_of(observation), demand_w)
         most_w = power_max_w(params)
-        engine_w = np.union1d(np.linspace(HOLD_ON_W, most_w, GRID), power_knots_w(params)[1:])
+        engine_w = _candidates_w(params)
         running = demand_w[:, None] - engine_w[None, :]
 
         # Whether to start is asked without the ramp limit: it lasts seconds, the running does not.
