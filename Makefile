@@ -1,6 +1,6 @@
 # Everything from a bare machine with Python 3.10-3.13, make and a C compiler. Each target builds .venv when needed.
 PYTHON ?= python3
-EXTRAS ?= ros,train,tensorboard,test,colcon
+EXTRAS ?= ros,train,tensorboard,gym,examples,test,colcon
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed

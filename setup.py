@@ -116,6 +116,8 @@ setup(
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
         "train": ["torch>=2.2"],
         "tensorboard": ["tensorboard>=2.16"],
+        "gym": ["gymnasium>=1.1"],
+        "examples": ["gymnasium>=1.1", "stable-baselines3>=2.7"],
         "colcon": ["colcon-bash", "colcon-core", "colcon-python-setup-py", "colcon-ros"],
         # An extra, not tests_require, with which `colcon test` would run nothing and succeed.
         "test": [
