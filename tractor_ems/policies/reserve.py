@@ -22,7 +22,8 @@ just above it soon. Passes with their turns take two, a loader's strokes one."""
 
 def starts_slowly(params: PowertrainParams) -> bool:
     """Whether an engine that was stopped cannot carry the load in the very next step."""
-    return params.engine.min_off_s > 0.0 or math.isfinite(params.engine.ramp_w_per_s)
+    engine = params.engine
+    return engine.min_off_s > 0.0 or engine.ramp_w_per_s * params.dt_s < engine.power_max_w
 
 
 def recent_peak_w(
