@@ -67,7 +67,7 @@ def action_mask(
     power_w, top = actions.power_w, len(actions.power_w) - 1
     if actions.engine:
         first, last = _reaching(power_w, low_w, high_w)
-        first = np.where(limits.may_be_off, np.maximum(first, 1), first)
+        first = np.where(off, np.maximum(first, 1), first)
         at_off: IntArray = np.zeros_like(first)
     else:
         first, last = _reaching(power_w, power_demand_w - high_w, power_demand_w - low_w)
