@@ -1,21 +1,211 @@
-"""The upper end of the bracket: a run of the real plant, ramp limit and minimum times kept."""
+"""The upper end of the bracket: a run of the real plant, ramp limit and minimum times kept.
+
+The optimum of the relaxed model says when the engine runs and what energy is worth. A second,
+small programme then chooses engine powers that ramp and minimum times allow, battery energy at
+that price, and may move each start and stop a little.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
 
 from tractor_ems.drive import drive
-from tractor_ems.optimal.engine_dp import EngineSolution
+from tractor_ems.optimal.engine_dp import EngineSolution, model_of, solve_engine
+from tractor_ems.optimal.engine_kernel import follow
+from tractor_ems.optimal.ramp_kernel import levels_while, priced_levels
 from tractor_ems.policies.planned import PlannedPolicy
-from tractor_msgs_py.trajectory import Trajectory
+from tractor_msgs_py.trajectory import BoolArray, FloatArray, Trajectory
+from tractor_sim.battery import discharge_current_a, power_limits_w
+from tractor_sim.engine import fuel_rate_kg_per_s
+from tractor_sim.generator import to_bus_w
 from tractor_sim.powertrain import PowertrainParams
 
+LEVELS = 110
+"""About how many engine powers are told apart: 2.5 kW on "field"."""
 
-def plan_policy(params: PowertrainParams, solution: EngineSolution) -> PlannedPolicy:
-    """The optimum as the real plant can drive it."""
-    plan = solution.plan
-    return PlannedPolicy(params, solution.power_demand_w, plan.engine_power_w, plan.engine_on)
+MOVE_S = 10.0
+"""How far a start or stop may be moved [s]."""
+
+PENALTY_KG = 10.0
+"""Price of a step in a state that the schedule does not allow, and of 1 kW of unmet demand."""
+
+PRICE_SPREAD = 1.5
+"""The price stays within this factor of its median. At the ends of a cycle, where hardly any
+choice is left, the co-state says what the last joule costs, not what energy is worth."""
+
+GROWTH, PRICE_STEP, SEARCH_STEPS = 1.02, 1e-4, 50
+"""Of the search for the factor on the price at which the plan ends where it should."""
+
+SOC_MARGIN = 0.004
+"""Kept off the window's ends where the relaxed optimum leaves no room there for ramps."""
+
+
+@dataclass(frozen=True)
+class _Levels:
+    """Engine powers at the crankshaft and at the bus (M,) [W], their fuel per step (M,) [kg], and
+    how many levels one step may change by."""
+
+    crank_w: FloatArray
+    bus_w: FloatArray
+    fuel_kg: FloatArray
+    reach: int
 
 
 def drive_plan(params: PowertrainParams, solution: EngineSolution) -> Trajectory:
-    """That run, driven."""
+    """The optimum as the real plant can drive it, driven."""
     soc = float(solution.plan.soc[0])
     target = soc if solution.soc_target is None else solution.soc_target
     policy = plan_policy(params, solution)
     return drive(policy, params, solution.power_demand_w[None, :], soc, target)[0]
+
+
+def plan_policy(params: PowertrainParams, solution: EngineSolution) -> PlannedPolicy:
+    """The optimum as the real plant can drive it."""
+    engine_w, engine_on, met = _plan(params, solution)
+    if not met:
+        solution = _with_margin(params, solution)
+        engine_w, engine_on, _ = _plan(params, solution)
+    return PlannedPolicy(params, solution.power_demand_w, engine_w, engine_on)
+
+
+def _plan(
+    params: PowertrainParams, solution: EngineSolution
+) -> tuple[FloatArray, BoolArray, bool]:
+    """Engine power at the bus and on or off (T,), and whether the battery can carry the rest."""
+    relaxed, demand_w = solution.plan, solution.power_demand_w
+    engine = params.engine
+    if math.isinf(engine.ramp_w_per_s) and engine.min_on_s == engine.min_off_s == 0.0:
+        return relaxed.engine_power_w, relaxed.engine_on, True
+    levels = _levels(params)
+    price_kg = solution.co_state_kg_per_j * params.battery.energy_j
+    middle = float(np.median(price_kg))
+    price_kg = np.clip(price_kg, middle / PRICE_SPREAD, middle * PRICE_SPREAD)
+    chosen = np.empty(len(demand_w), dtype=np.int64)
+    on_kg, off_kg = _costs(params, levels, solution, price_kg)
+    move = round(MOVE_S / params.dt_s)
+    may_run, may_stand = _within(move, relaxed.engine_on), _within(move, ~relaxed.engine_on)
+    priced_levels(
+        on_kg + PENALTY_KG * ~may_run[:, None],
+        off_kg + PENALTY_KG * ~may_stand,
+        engine.start_fuel_kg,
+        levels.reach,
+        max(1, math.ceil(engine.min_on_s / params.dt_s - 1e-9)),
+        max(1, math.ceil(engine.min_off_s / params.dt_s - 1e-9)),
+        chosen,
+    )
+    engine_on = chosen >= 0
+
+    def crank_w(factor: float) -> FloatArray:
+        costs_kg, _ = _costs(params, levels, solution, factor * price_kg)
+        levels_while(costs_kg, engine_on, levels.reach, chosen)
+        return np.where(engine_on, levels.crank_w[np.maximum(chosen, 0)], 0.0)
+
+    plan_w = _that_ends(params, solution, crank_w)
+    engine_w = to_bus_w(params.generator, plan_w, engine.power_max_w)
+    return engine_w, engine_on, _end(params, solution, plan_w)[1] <= 0.0
+
+
+def _levels(params: PowertrainParams) -> _Levels:
+    """Levels that divide the ramp of one step, and the engine's maximum."""
+    peak_w, spacing_w = params.engine.power_max_w, params.engine.power_max_w / LEVELS
+    ramp_w, reach = params.engine.ramp_w_per_s * params.dt_s, LEVELS + 1
+    if ramp_w < peak_w:
+        reach = math.ceil(ramp_w / spacing_w)
+        spacing_w = ramp_w / reach
+    crank_w = np.append(np.arange(0.0, peak_w - 1.0, spacing_w), peak_w)
+    fuel_kg = fuel_rate_kg_per_s(params.engine, crank_w, np.ones(crank_w.shape, dtype=bool))
+    bus_w = to_bus_w(params.generator, crank_w, peak_w)
+    return _Levels(crank_w, bus_w, fuel_kg * params.dt_s, reach)
+
+
+def _costs(
+    params: PowertrainParams, levels: _Levels, solution: EngineSolution, price_kg: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Cost of every step at every level (T, M) and with the engine off (T,): fuel, and what the
+    battery gives at ``price_kg`` (T,) per SOC, taken at the SOC of the relaxed optimum."""
+    battery, soc = params.battery, solution.plan.soc[:-1, None]
+    charge_w, discharge_w = power_limits_w(battery, soc, params.dt_s)
+    wanted_w = solution.power_demand_w[:, None] - np.append(0.0, levels.bus_w)
+    power_w = np.clip(wanted_w, -charge_w, discharge_w)
+    soc = np.broadcast_to(soc, power_w.shape)
+    taken = discharge_current_a(battery, soc, power_w) * params.dt_s / battery.charge_c
+    cost_kg = taken * price_kg[:, None] + np.append(0.0, levels.fuel_kg)
+    cost_kg += PENALTY_KG * 1e-3 * np.maximum(wanted_w - discharge_w - 1.0, 0.0)
+    return np.ascontiguousarray(cost_kg[:, 1:]), np.ascontiguousarray(cost_kg[:, 0])
+
+
+def _within(steps: int, state: BoolArray) -> BoolArray:
+    """Where ``state`` (T,) is true at most ``steps`` before or after."""
+    padded = np.pad(state.astype(np.float64), steps)
+    near: BoolArray = np.convolve(padded, np.ones(2 * steps + 1), mode="valid") > 0.5
+    return near
+
+
+def _that_ends(
+    params: PowertrainParams, solution: EngineSolution, crank_w: Callable[[float], FloatArray]
+) -> FloatArray:
+    """The plan (T,) [W] that ends where it should: between those of two prices of energy.
+
+    Any plan between two that keep to a ramp limit keeps to it too.
+    """
+    target = solution.soc_target
+    above = below = crank_w(1.0)
+    if target is None:
+        return above
+    low = high = 1.0
+    for _ in range(SEARCH_STEPS):
+        if _end(params, solution, above)[0] >= target:
+            break
+        high *= GROWTH
+        above = crank_w(high)
+    for _ in range(SEARCH_STEPS):
+        if _end(params, solution, below)[0] <= target:
+            break
+        low /= GROWTH
+        below = crank_w(low)
+    while high - low > PRICE_STEP:
+        middle = 0.5 * (low + high)
+        plan_w = crank_w(middle)
+        if _end(params, solution, plan_w)[0] >= target:
+            high, above = middle, plan_w
+        else:
+            low, below = middle, plan_w
+    share, step = 1.0, 0.5
+    for _ in range(SEARCH_STEPS):  # of ``above``, the least that ends at the target
+        if _end(params, solution, below + (share - step) * (above - below))[0] >= target:
+            share -= step
+        step *= 0.5
+    plan_w = below + share * (above - below)
+    return plan_w
+
+
+def _end(
+    params: PowertrainParams, solution: EngineSolution, crank_w: FloatArray
+) -> tuple[float, float]:
+    """SOC at the end of a plan, and how much the battery fails to carry [J]."""
+    engine_w = to_bus_w(params.generator, crank_w, params.engine.power_max_w)
+    soc = float(solution.plan.soc[0])
+    battery_w = solution.power_demand_w - engine_w
+    soc_end, short_w = follow(model_of(params), battery_w, soc)
+    return soc_end, short_w * params.dt_s
+
+
+def _with_margin(params: PowertrainParams, solution: EngineSolution) -> EngineSolution:
+    """The optimum that keeps off the ends of the battery's window."""
+    battery = params.battery
+    ends = [float(solution.plan.soc[0]), float(solution.plan.soc[-1])]
+    inside = dataclasses.replace(
+        battery,
+        soc_min=min(battery.soc_min + SOC_MARGIN, *ends),
+        soc_max=max(battery.soc_max - SOC_MARGIN, *ends),
+    )
+    return solve_engine(
+        dataclasses.replace(params, battery=inside),
+        solution.power_demand_w,
+        ends[0],
+        solution.soc_target,
+        end_price_kg_per_j=solution.end_price_kg_per_j,
+    )

@@ -1,7 +1,8 @@
 """Backward dynamic programme over SOC: least fuel for a known cycle that ends at a target SOC.
 
 For a powertrain without engine memory (no start fuel, minimum times or ramp limit) and battery
-losses; any other is ``engine_dp``'s. What it drives on the real plant is ``rollout``; whether a grid is fine enough is ``certificate``.
+losses; any other is ``engine_dp``'s. What it drives on the real plant is ``rollout``; whether a
+grid is fine enough is ``certificate``.
 """
 
 import math

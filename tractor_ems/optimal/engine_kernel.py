@@ -353,6 +353,20 @@ def co_states(
 
 
 @njit(cache=True, error_model="numpy")
+def follow(model: Model, battery_w: FloatArray, soc: float) -> tuple[float, float]:
+    """Drive battery powers (T,) from ``soc``: where they end, and the sum of what the battery
+    could not give [W]; what it cannot take is dissipated."""
+    numbers, ocv, short_w = model.numbers, model.ocv, 0.0
+    for wanted_w in battery_w:
+        ocv_v = open_circuit_v(ocv, soc)
+        charge, discharge = limits_w(numbers, soc, ocv_v)
+        if wanted_w > discharge + ROUNDING_W:
+            short_w += wanted_w - discharge
+        soc = soc_after(numbers, soc, ocv_v, max(min(wanted_w, discharge), -charge))
+    return soc, short_w
+
+
+@njit(cache=True, error_model="numpy")
 def reachable(
     model: Model, demand_w: FloatArray, soc_initial: float, low: FloatArray, high: FloatArray
 ) -> None:
