@@ -19,6 +19,8 @@ _CELL_M = 5.0
 _AIR_KG_PER_M3 = 1.2
 _CREEP_M_PER_S = 0.7
 _CAP_ROUNDS = 12
+_FOOT = np.array([0.25, 0.5, 0.25])
+"""A foot takes seconds from brake to power: weights of three seconds of demand (assumed)."""
 
 
 @dataclass(frozen=True)
@@ -91,5 +93,6 @@ def drive_route(
     power = (moving * move_s + work.idle_w * route.dwell_s) / cell_s
     standing = route.dwell_s / cell_s
     steps = to_steps(route.duration_s, cell_s, power, np.zeros_like(power), 1 - standing, standing)
-    noisy = steps.power_w + route.noise * np.abs(steps.power_w) * steps.working
+    power = np.convolve(np.pad(steps.power_w, 1, mode="edge"), _FOOT, mode="valid")
+    noisy = power + route.noise * np.abs(power) * steps.working
     return Steps(noisy, steps.working, steps.standing, 0.0)
