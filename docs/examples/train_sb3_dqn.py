@@ -1,6 +1,6 @@
 """Train stable-baselines3's DQN on the plant and compare it with a rule.
 
-    pip install 'tractor_ems[examples]'
+    pip install '.[examples]'  # in a checkout; `make` has done so
     python docs/examples/train_sb3_dqn.py --steps 200000
 
 It shows how another library's learner meets this environment: SB3 knows nothing of tractors, and

@@ -1,7 +1,7 @@
 """The plant as a Gymnasium environment, one at a time or many at once: docs/gymnasium.md.
 
 Importing this registers ``tractor_sim/SeriesHybrid-v0``. Nothing else imports it: Gymnasium is an
-optional extra, ``pip install 'tractor_ems[gym]'``.
+optional extra, ``pip install '.[gym]'``.
 """
 
 import gymnasium
