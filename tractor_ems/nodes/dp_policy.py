@@ -1,11 +1,14 @@
 """The optimum of one known cycle as a node: solves it at start and drives no other."""
 
+import dataclasses
 import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from tractor_ems.nodes.policy_node import PolicySetup, run_policy_node
+from tractor_ems.optimal.bracket import plan_policy
 from tractor_ems.optimal.dp import solve
+from tractor_ems.optimal.engine_dp import has_engine_state, solve_engine
 from tractor_ems.policies.dp import DpPolicy
 from tractor_msgs_py.errors import CycleError, PolicyError
 from tractor_msgs_py.ros.shell import Parameter
@@ -26,6 +29,7 @@ PARAMETERS = (
         -1,
         1,
     ),
+    # A plant with engine state has grids of its own.
     Parameter("soc_points", 401, "nodes of the SOC grid at every step", "nodes", 4, 5_000),
     Parameter("actions", 1600, "battery powers of the action grid", "actions", 2, 20_000),
 )
@@ -36,16 +40,21 @@ def prepare(values: Mapping[str, Any]) -> PolicySetup:
     run = prepare_run(
         values["powertrain"], values["cycle"], values["soc_initial"], values["soc_target"]
     )
+    params, info = run.params, run.info
+    if has_engine_state(params):
+        plan = solve_engine(params, run.power_demand_w, info.soc_initial, info.soc_target)
+        planned = dataclasses.replace(plan_policy(params, plan), t0_ns=info.t0_ns)
+        return PolicySetup(planned, info.powertrain_hash, only(info))
     solution = solve(
-        run.params,
+        params,
         run.power_demand_w,
-        run.info.soc_target,
-        soc_initial=run.info.soc_initial,
+        info.soc_target,
+        soc_initial=info.soc_initial,
         soc_points=values["soc_points"],
         actions=values["actions"],
     )
-    policy = DpPolicy(run.params, solution, t0_ns=run.info.t0_ns)
-    return PolicySetup(policy, run.info.powertrain_hash, only(run.info))
+    policy = DpPolicy(params, solution, t0_ns=info.t0_ns)
+    return PolicySetup(policy, info.powertrain_hash, only(info))
 
 
 def only(solved: RunInfo) -> Callable[[RunInfo], None]:
