@@ -53,7 +53,7 @@ def test_soc_counts_coulombs_not_joules():
     assert soc_after(FLAT, soc, one(-41e3), 36.0)[0] == pytest.approx(0.52, abs=1e-12)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(soc=st.floats(0.30, 0.80), power_w=st.floats(-150e3, 150e3))
 def test_cell_power_is_terminal_power_plus_ohmic_loss(soc, power_w):
     soc, power = one(soc), one(power_w)
@@ -91,7 +91,7 @@ def test_no_more_power_than_matched_load_leaves_a_battery_of_high_resistance():
     np.testing.assert_allclose(discharge_current_a(weak, np.full(3, 0.5), asked_w), 200.0)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(gap=st.floats(0.0, 5e-4), dt_s=st.sampled_from([0.1, 1.0, 10.0]))
 def test_limits_lead_exactly_to_the_ends_of_the_soc_window(gap, dt_s):
     near_empty, near_full = one(FIELD.soc_min + gap), one(FIELD.soc_max - gap)

@@ -88,7 +88,7 @@ def test_data_that_begin_above_zero_are_joined_to_idling_by_a_line():
     np.testing.assert_allclose(hull, [2e-4, 3e-3, 6e-3])
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     steps=st.lists(st.floats(1e-5, 4e-3), min_size=2, max_size=12),
     idle=st.floats(0.0, 1e-3),

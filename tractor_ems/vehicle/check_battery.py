@@ -14,6 +14,8 @@ PASS_START = (0.13, 0.87, 0.29)
 """Measured field work: from the headland's 0.13 of rated power to the pass's 0.87, at up to 0.29
 of rated power a second."""
 
+LONGEST_BRIDGE_S = 600.0
+
 
 def battery_figures(params: PowertrainParams) -> dict[str, float | None]:
     """Figures by name, SI but for those that say otherwise."""
@@ -51,17 +53,22 @@ def battery_figures(params: PowertrainParams) -> dict[str, float | None]:
 
 def bridging(params: PowertrainParams) -> tuple[float, float]:
     """Battery power [W] and energy [J] that a measured pass start asks for while the engine, off
-    at first, ramps up to carry all of it; auxiliaries included."""
-    engine, peak_w = params.engine, params.engine.power_max_w
+    at first, follows the load as fast as its ramp allows; auxiliaries included."""
+    engine, peak_w, dt_s = params.engine, params.engine.power_max_w, params.dt_s
     rated_w = float(knots_w(params.generator, peak_w)[1][-1])
     low, high, rate = PASS_START
-    seconds = np.arange(0.0, (high - low) / rate + peak_w / engine.ramp_w_per_s + 5.0, params.dt_s)
-    demand_w = rated_w * np.minimum(low + rate * seconds, high) + params.p_aux_w
-    demand_w = np.minimum(demand_w, rated_w)
-    crank_w = np.minimum(engine.ramp_w_per_s * (seconds + params.dt_s), peak_w)
-    engine_w = to_bus_w(params.generator, crank_w, peak_w)
-    missing_w = np.maximum(demand_w - engine_w, 0.0)
-    return float(missing_w.max()), float(missing_w.sum() * params.dt_s)
+    missing_w, crank_w, elapsed_s = [], 0.0, 0.0
+    while True:
+        share = min(low + rate * elapsed_s, high)
+        demand_w = min(rated_w * share + params.p_aux_w, rated_w)
+        wanted_w = float(to_crank_w(params.generator, np.array(demand_w), peak_w))
+        crank_w = min(wanted_w, crank_w + engine.ramp_w_per_s * dt_s)
+        engine_w = float(to_bus_w(params.generator, np.array(crank_w), peak_w))
+        missing_w.append(demand_w - engine_w)
+        elapsed_s += dt_s
+        done = share == high and crank_w == wanted_w
+        if done or elapsed_s > LONGEST_BRIDGE_S:
+            return max(missing_w), sum(missing_w) * dt_s
 
 
 def judge_battery(

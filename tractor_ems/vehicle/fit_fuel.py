@@ -183,7 +183,7 @@ def _start_estimate(solution: Solution, starts: int, comparable: int) -> Estimat
     if not starts:
         return Estimate(name, None, None, "not_identified", "the engine was never started")
     if not comparable:
-        why = f"{starts} starts, all at powers at which the engine did not run otherwise"
+        why = f"the engine ran at no power of its starts ({starts}) otherwise"
         return Estimate(name, None, None, "not_identified", why)
     error = float(solution.error[-1])
     value = float(solution.coefficients[-1])

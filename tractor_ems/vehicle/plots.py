@@ -34,7 +34,8 @@ def plot_vehicle(path: Path, vehicle: Vehicle) -> None:
         ConfigError: ``path`` cannot be written.
     """
     curves = fuel_curves(vehicle)
-    figure = Figure(figsize=(13, 10.5), layout="constrained")
+    figure = Figure(figsize=(13, 10.5))
+    figure.subplots_adjust(0.055, 0.05, 0.985, 0.93, 0.2, 0.33)
     FigureCanvasAgg(figure)
     figure.suptitle(f"powertrain {vehicle.params.name}")
     panels = figure.subplots(3, 3)
