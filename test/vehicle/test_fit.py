@@ -226,6 +226,14 @@ def test_powers_never_visited_are_named(tmp_path):
     assert estimates["engine.idle_fuel_kg_per_s"].verdict == "not_identified"
 
 
+def test_a_handful_of_powers_is_no_curve(field_fit):
+    clean = field_fit.recorded
+    held_w = np.round(clean.engine_w / 60e3) * 60e3
+    fit_of_few = fit_fuel(dataclasses.replace(clean, engine_w=held_w), 42.7e6)
+    assert not fit_of_few.identified
+    assert "different powers" in fit_of_few.estimates[0].why
+
+
 def test_coarse_soc_and_missing_voltage_are_named(field_fit):
     clean = field_fit.recorded
     found = fit_battery(

@@ -14,7 +14,7 @@ PASS_START = (0.13, 0.87, 0.29)
 """Measured field work: from the headland's 0.13 of rated power to the pass's 0.87, at up to 0.29
 of rated power a second."""
 
-LONGEST_BRIDGE_S = 600.0
+LONGEST_BRIDGE_S, SHORTEST_STEP_S = 600.0, 0.1
 
 
 def battery_figures(params: PowertrainParams) -> dict[str, float | None]:
@@ -54,7 +54,8 @@ def battery_figures(params: PowertrainParams) -> dict[str, float | None]:
 def bridging(params: PowertrainParams) -> tuple[float, float]:
     """Battery power [W] and energy [J] that a measured pass start asks for while the engine, off
     at first, follows the load as fast as its ramp allows; auxiliaries included."""
-    engine, peak_w, dt_s = params.engine, params.engine.power_max_w, params.dt_s
+    engine, peak_w = params.engine, params.engine.power_max_w
+    dt_s = max(params.dt_s, SHORTEST_STEP_S)
     rated_w = float(knots_w(params.generator, peak_w)[1][-1])
     low, high, rate = PASS_START
     missing_w, crank_w, elapsed_s = [], 0.0, 0.0

@@ -205,11 +205,13 @@ def _soc_notes(recorded: Recorded) -> list[str]:
     values = np.unique(recorded.soc)
     if len(values) < 2:
         return [f"SOC never moves from {values[0]:.6f}"]
+    current = np.abs(np.nan_to_num(recorded.current_a))
+    flowing = current[1:] > 0.02 * current.max()
+    stuck = np.mean((np.diff(recorded.soc) == 0.0)[flowing]) if flowing.any() else 0.0
+    if stuck < 0.5:
+        return []
     step = float(np.median(np.diff(values)))
-    notes = []
-    if step > 1e-3 or len(values) < len(recorded) / 20:
-        notes.append(f"SOC comes in {len(values)} values about {step:.2g} apart")
-    return notes
+    return [f"SOC comes in {len(values)} values about {step:.2g} apart"]
 
 
 def _voltage_notes(solution: Solution, current: FloatArray, charge_c: float | None) -> list[str]:

@@ -22,7 +22,7 @@ from tractor_msgs_py.trajectory import BoolArray, FloatArray
 CELLS = 50
 """Most cells of the curve between least and largest power."""
 
-LEAST_STEPS = 30
+LEAST_STEPS, LEAST_POWERS = 30, 10
 GAP = 0.05
 """A range without a sample that is wider than this share of the largest power is a gap."""
 
@@ -85,6 +85,10 @@ def fit_fuel(recorded: Recorded, lhv_j_per_kg: float) -> FuelFit:
     low_w, high_w = float(power_w[running].min()), float(power_w[running].max())
     if high_w - low_w < 0.02 * high_w or high_w <= 0.0:
         return _point(power_w, rate, started, recorded.dt_s[on])
+    powers = len(np.unique(np.round(power_w[running] / (0.005 * high_w))))
+    if powers < LEAST_POWERS:
+        why = f"the engine ran at {powers} different powers, need {LEAST_POWERS}"
+        return _nothing(why, len(rate), starts)
     spacing_w = max((high_w - low_w) / CELLS, 0.01 * high_w)
     knots_w = knots_where_sampled(power_w[running], spacing_w)
     # Without a running step near it a start step says nothing about either: leave it out.
@@ -106,7 +110,7 @@ def fit_fuel(recorded: Recorded, lhv_j_per_kg: float) -> FuelFit:
     )
     return FuelFit(
         bus_w=knots_w,
-        fuel_kg_per_s=fuel + knots_w / lhv_j_per_kg,
+        fuel_kg_per_s=np.maximum(fuel, 0.0) + knots_w / lhv_j_per_kg,
         error_kg_per_s=error,
         slope_kg_per_j=(float(slopes[0]), float(slopes[-1])),
         rms_kg_per_s=solution.rms,

@@ -125,7 +125,7 @@ def _engine(found: VehicleFit, origins: Origins) -> tuple[dict[str, Any], dict[s
         )
         crank_w = np.unique(np.round(crank_w, 1))
         crank_w[-1] = peak_w
-        rate = fuel.fuel_at(to_bus_w(generator, crank_w, peak_w))
+        rate = np.maximum(fuel.fuel_at(to_bus_w(generator, crank_w, peak_w)), 0.0)
         engine["idle_fuel_kg_per_s"] = float(rate[0])
         engine["curve"] = "fitted"
         engine["curves"] = {"fitted": _pairs(crank_w, rate)}
