@@ -12,15 +12,13 @@ from tractor_ems.optimal.certificate import (
     ROLLOUT_LIMIT,
     Certificate,
 )
-from tractor_ems.optimal.engine_dp import EngineSolution, solve_engine
+from tractor_ems.optimal.engine_dp import EngineSolution, solve_engine, usual_cell_j
 from tractor_msgs_py.trajectory import FloatArray
 from tractor_sim.powertrain import PowertrainParams
 
-COARSE_CELL_J = 160e3
-"""First-pass cell of the coarser solution; the certificate is about the one with half of it."""
-
-FINEST_CELL_J = 10e3
-"""Refinement ends here."""
+HALVINGS = 4
+"""Of the first pass's cell at most. The coarsest is twice the usual one, so that a certificate is
+mostly about the solution that everybody else gets."""
 
 
 def certify_engine(
@@ -35,9 +33,9 @@ def certify_engine(
 
     ``bracket``: also drive the real plant and report the width; without it that is None.
     """
-    cell_j = COARSE_CELL_J
+    cell_j = 2.0 * usual_cell_j(len(power_demand_w))
     coarse = solve_engine(params, power_demand_w, soc_initial, soc_final, cell_j=cell_j)
-    while True:
+    for halving in range(1, HALVINGS + 1):
         cell_j = 0.5 * cell_j
         fine = solve_engine(params, power_demand_w, soc_initial, soc_final, cell_j=cell_j)
         scale_kg = max(fine.lower_bound_kg, NEGLIGIBLE_KG)
@@ -45,7 +43,7 @@ def certify_engine(
         gap = (fine.cost_kg - fine.value_kg) / scale_kg
         residual = _residual_kg(params, fine, fine.plan.soc[-1]) / scale_kg
         stands = change < HALVING_LIMIT and abs(gap) < ROLLOUT_LIMIT and residual < RESIDUAL_LIMIT
-        if stands or 0.5 * cell_j < FINEST_CELL_J:
+        if stands or halving == HALVINGS:
             break
         coarse = fine
     width = bracket_width(params, fine) if bracket else None

@@ -32,9 +32,9 @@ from tractor_sim.generator import to_crank_w
 from tractor_sim.powertrain import PlantState, PowertrainParams, step
 from tractor_sim.powertrain_json import powertrain_hash
 
-CELL_J = 80e3
-"""Default distance of SOC nodes in the first pass over the whole window. A run of the paper's
-mean power moves several of these a second."""
+CELL_J, FULL_STEPS, LEAST_CELL_J = 80e3, 1800, 5e3
+"""Distance of SOC nodes in the first pass over the whole window, for a cycle of so many steps or
+more; a shorter one gets finer nodes in proportion, which cost no more."""
 
 REFINEMENT = 4
 """How much finer the nodes of the second pass are, in a band around the first one's optimum."""
@@ -136,6 +136,11 @@ def relaxed(params: PowertrainParams) -> PowertrainParams:
     return dataclasses.replace(params, engine=engine)
 
 
+def usual_cell_j(steps: int) -> float:
+    """Distance of the nodes of the first pass for a cycle of that many steps [J]."""
+    return min(max(CELL_J * steps / FULL_STEPS, LEAST_CELL_J), CELL_J)
+
+
 def solve_engine(
     params: PowertrainParams,
     power_demand_w: FloatArray,
@@ -143,7 +148,7 @@ def solve_engine(
     soc_target: float | None,
     *,
     end_price_kg_per_j: float | None = None,
-    cell_j: float = CELL_J,
+    cell_j: float | None = None,
 ) -> EngineSolution:
     """Solve one cycle from ``soc_initial`` with the engine off.
 
@@ -152,14 +157,15 @@ def solve_engine(
         soc_target: SOC to end at (the nearest where it cannot be reached): ending above costs
             nothing, below more than any way to avoid it. None: the end is free.
         end_price_kg_per_j: only with a free end: what a joule left at the end is worth, >= 0.
-        cell_j: distance of the nodes of the first pass, > 0; a second one is
-            :data:`REFINEMENT` times finer.
+        cell_j: distance of the nodes of the first pass, > 0, by default :func:`usual_cell_j`; a
+            second one is :data:`REFINEMENT` times finer.
 
     Raises:
         ConfigError: a SOC, price or cell is out of range.
         CycleError: the demand is empty or not finite.
     """
     demand_w = np.ascontiguousarray(power_demand_w, dtype=np.float64)
+    cell_j = usual_cell_j(demand_w.size) if cell_j is None else cell_j
     _check(params, demand_w, soc_initial, soc_target, end_price_kg_per_j, cell_j)
     model = model_of(params)
     low, high = soc_of_use(model, demand_w, soc_initial, soc_target, end_price_kg_per_j)
