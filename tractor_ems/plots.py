@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from tractor_msgs_py.atomic import write_bytes_with
 from tractor_msgs_py.trajectory import Trajectory
 from tractor_sim.engine import efficiency
+from tractor_sim.generator import to_crank_w
 from tractor_sim.powertrain import PowertrainParams
 
 # Okabe-Ito: told apart by colour-blind readers and in print.
@@ -72,7 +73,8 @@ def _operating_points(
     power_w = np.linspace(0.0, engine.power_max_w, 500)
     axes.plot(power_w / 1e3, efficiency(engine, power_w) * 100, "grey", linewidth=1)
     for row, ((name, run), colour) in enumerate(zip(runs.items(), COLOURS, strict=False)):
-        on_w = run.engine_power_w[run.engine_power_w > 0]
+        bus_w = run.engine_power_w[run.engine_power_w > 0]
+        on_w = to_crank_w(params.generator, bus_w, engine.power_max_w)
         share = len(on_w) / len(run)
         # Marker areas are proportional to the time spent there; rows are offset to stay visible.
         counts, edges = np.histogram(on_w, bins=70, range=(0.0, engine.power_max_w))
@@ -87,9 +89,9 @@ def _operating_points(
             edgecolors="none",
             label=f"{name} (on {share:.0%})",
         )
-    axes.set_xlabel("engine power [kW]; area: share of time; rows offset by 0.9 points")
+    axes.set_xlabel("crankshaft power [kW]; area: share of time; rows offset by 0.9 points")
     axes.set_ylabel("efficiency [%]")
-    axes.set_ylim(0, max(engine.curve_efficiency) * 100 + 9)
+    axes.set_ylim(0, float(efficiency(engine, power_w).max()) * 100 + 9)
     legend = axes.legend(fontsize="small", loc="lower right")
     for handle in legend.legend_handles:
         if handle is not None and hasattr(handle, "set_sizes"):

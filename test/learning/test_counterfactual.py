@@ -135,6 +135,13 @@ def test_the_baseline_depends_on_demand_alone_and_changes_no_choice(paper: Power
     assert np.abs(baseline - expected).max() < 1e-3
 
 
+def test_a_battery_with_losses_is_refused_in_one_line(paper: PowertrainParams):
+    lossy = replace(paper, battery=replace(paper.battery, resistance_ohm=0.08))
+    demand = np.full(10, 100e3)
+    with pytest.raises(ConfigError, match="battery with losses"):
+        problem_of(lossy, RewardConfig(), [demand], CounterfactualConfig())
+
+
 def test_a_ramp_limit_is_refused_in_one_line(paper: PowertrainParams):
     ramped = replace(paper, engine=replace(paper.engine, ramp_w_per_s=60e3))
     demand = load_cycle("planter_20").power_demand_w[:60]

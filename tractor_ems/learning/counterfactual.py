@@ -79,13 +79,18 @@ def make_problem(
 
     Raises:
         ConfigError: the engine has a ramp limit or minimum times, whose state these targets do
-            not carry.
+            not carry, or the battery has losses.
     """
     engine = params.engine
     if np.isfinite(engine.ramp_w_per_s) or engine.min_on_s > 0 or engine.min_off_s > 0:
         raise ConfigError(
             f"targets counterfactual: powertrain {params.name} has a ramp limit or minimum on/off "
             "times, which need targets sampled"
+        )
+    if not params.battery.lossless:
+        raise ConfigError(
+            f"targets counterfactual: powertrain {params.name} has a battery with losses, which "
+            "needs targets sampled"
         )
     demand_w = samples.power_demand_w
     table = build_cost_table(reward, params, actions, float(demand_w.min()), float(demand_w.max()))

@@ -112,8 +112,8 @@ def make_mdp(
     """Fill in the numbers.
 
     Raises:
-        ConfigError: the powertrain has engine memory, a generator with losses or an idle rate, or
-            the reward a price per start: all more than [P_dem, SOC] can tell.
+        ConfigError: the powertrain has engine memory, losses in generator or battery, a fuel
+            curve or an idle rate, or the reward a price per start: more than these agents know.
     """
     engine, battery = params.engine, params.battery
     simple = (
@@ -122,7 +122,9 @@ def make_mdp(
         ("engine.min_off_s", engine.min_off_s, 0.0),
         ("engine.ramp_w_per_s", engine.ramp_w_per_s, math.inf),
         ("engine.idle_fuel_kg_per_s", engine.idle_fuel_kg_per_s, 0.0),
+        ("engine.curve_fuel_kg_per_s", engine.curve_fuel_kg_per_s, ()),
         ("generator.ideal", params.generator.ideal, True),
+        ("battery.lossless", battery.lossless, True),
     )
     for name, value, wanted in simple:
         if value != wanted:
