@@ -9,7 +9,13 @@ import numpy as np
 
 from tractor_ems.policies.genset import power_max_w
 from tractor_ems.policies.protocol import limits_of
-from tractor_ems.policies.reserve import beyond_battery_w, hold_power_w, must_hold, recent_peak_w
+from tractor_ems.policies.reserve import (
+    beyond_battery_w,
+    hold_power_w,
+    must_hold,
+    recent_peak_w,
+    support_w,
+)
 from tractor_msgs_py.errors import PolicyError
 from tractor_msgs_py.observation import DemandFilter, Observation, ObservationSpec
 from tractor_msgs_py.trajectory import BoolArray, FloatArray
@@ -94,14 +100,14 @@ class LoadLevelling:
         demand_w = observation.power_demand_w
         discharge_w = observation.discharge_limit_w
         peak_w = recent_peak_w(self.powertrain, state.peak_w, demand_w)
-        needed_w = beyond_battery_w(self.powertrain, demand_w, discharge_w)
+        needed_w = support_w(self.powertrain, demand_w, discharge_w, observation.engine_on)
         # Remembered, not read off the engine: an engine that is only held must not be taken for
         # one in a stretch, or it would change between idling and the least power each second.
         working = level_w > np.where(
             state.working, self.stop_share * most_w, self.start_share * most_w
         )
         held = observation.engine_on & must_hold(self.powertrain, peak_w, discharge_w)
-        run = working | held | (needed_w > 0.0)
+        run = working | held | (beyond_battery_w(self.powertrain, demand_w, discharge_w) > 0.0)
         least_w = np.where(working, self.least_share * most_w, 0.0)
         hold_w = hold_power_w(self.powertrain, peak_w, discharge_w)
         engine_w = np.maximum.reduce([level_w, least_w, needed_w, hold_w])
