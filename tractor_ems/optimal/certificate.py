@@ -54,7 +54,8 @@ class Certificate:
         residual: priced energy missing at the end of the roll-out, relative to its fuel.
         bracket_width: (a run of the real plant - fuel_kg) / fuel_kg, the run's residual priced.
             Where the plant has no engine state that run is the roll-out, set against V. None
-            where it was not asked for.
+            where it was not asked for, or (then not ok) where that run leaves demand unmet that
+            the optimum meets.
         soc_points, actions: the finer grid; with engine state the nodes that the whole window
             would have, and engine powers as far apart as the nodes.
         fuel_kg: the reference of the score: fuel of the roll-out on the real plant, its residual

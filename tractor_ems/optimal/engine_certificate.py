@@ -60,17 +60,17 @@ def certify_engine(
         soc_final=float(fine.plan.soc[-1]),
         starts=fine.plan.starts,
         stops=fine.plan.stops,
-        ok=stands and (width is None or width <= BRACKET_LIMIT),
+        ok=stands and (not bracket or (width is not None and width <= BRACKET_LIMIT)),
     )
     return certificate, fine
 
 
-def bracket_width(params: PowertrainParams, solution: EngineSolution) -> float:
-    """(Fuel of the best known run of the real plant - lower bound) / lower bound; energy missing
-    at its end is priced at the co-state, shortfall makes it infinite."""
+def bracket_width(params: PowertrainParams, solution: EngineSolution) -> float | None:
+    """(Fuel of a run of the real plant - lower bound) / lower bound, energy missing at its end
+    priced at the co-state; None where that run leaves demand unmet that the optimum meets."""
     run = drive_plan(params, solution)
     if run.shortfall_j.sum() > solution.plan.shortfall_j.sum():
-        return float("inf")
+        return None
     upper_kg = float(run.fuel_kg.sum()) + _residual_kg(params, solution, run.soc_final)
     lower_kg = solution.lower_bound_kg
     return (upper_kg - lower_kg) / max(lower_kg, NEGLIGIBLE_KG)

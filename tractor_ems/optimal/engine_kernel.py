@@ -333,23 +333,28 @@ def co_states(
     co_state: FloatArray,
 ) -> None:
     """Fill ``co_state`` (T,) with -dV_k/dSOC along a run [kg]: the secant over ``reach`` on either
-    side as far as the row goes, because the slope of one cell carries the ripple of starts."""
+    side as far as the row goes, because the slope of one cell carries the ripple of starts.
+
+    Where the run is at an end of its row (the last coast to the target, a full battery) V has a
+    kink there and the co-state is the one that the run came with.
+    """
+    edge = 1e-3 * rows.cell
+    co_state[:] = np.nan
     for k in range(len(co_state)):
         row = row_of(rows, k)
         values = value_on[k] if k > 0 and engine_on[k - 1] else value_off[k]
         low, high = max(row.low, soc[k] - reach), min(row.high, soc[k] + reach)
-        if high - low < 1e-9:  # no choice here: the price is the next step's with one
-            co_state[k] = np.nan
-            continue
-        left = value_at(values, row, low, model.numbers.missing_kg)
-        right = value_at(values, row, high, model.numbers.missing_kg)
-        co_state[k] = (left - right) / (high - low)
-    for k in range(len(co_state) - 2, -1, -1):
+        if low < soc[k] - edge and soc[k] + edge < high:
+            left = value_at(values, row, low, model.numbers.missing_kg)
+            right = value_at(values, row, high, model.numbers.missing_kg)
+            co_state[k] = (left - right) / (high - low)
+        elif k > 0:
+            co_state[k] = co_state[k - 1]
+    for k in range(len(co_state) - 2, -1, -1):  # the first steps, where there is no choice yet
         if np.isnan(co_state[k]):
             co_state[k] = co_state[k + 1]
-    for k in range(len(co_state)):
-        if np.isnan(co_state[k]):
-            co_state[k] = co_state[k - 1] if k > 0 else 0.0
+    if np.isnan(co_state[-1]):  # there never was a choice
+        co_state[:] = 0.0
 
 
 @njit(cache=True, error_model="numpy")
