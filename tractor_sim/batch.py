@@ -30,9 +30,6 @@ from tractor_sim.powertrain import (
 _BINS_MAX = 1 << 17
 """Most bins of a curve: half a megabyte."""
 
-_BLOCK = 512
-"""Plants of one call that a thread is given: what fits its first cache."""
-
 
 class BatchPlant(NamedTuple):
     """A powertrain for the compiled step; see ``batch_kernel`` for the fields."""
@@ -128,7 +125,7 @@ def step_batch(
     *,
     threads: int = 1,
 ) -> None:
-    """``powertrain.step`` of B plants, in place and without allocating.
+    """``powertrain.step`` of B plants, in place.
 
     Args:
         plant: of :func:`batch_plant`.
@@ -210,8 +207,7 @@ def drive_batch(
     _check_shape((len(power_demand_w), batch), inputs)
 
     def drive(begin: int, end: int) -> None:
-        for first in range(begin, end, _BLOCK):
-            drive_range(*plant, first, min(first + _BLOCK, end), *arrays)
+        drive_range(*plant, begin, end, *arrays)
 
     _share(batch, threads, drive)
     return totals
@@ -224,7 +220,13 @@ def limits_batch(plant: BatchPlant, state: PlantState) -> PowerLimits:
     may_be_off: BoolArray = np.empty(batch, dtype=bool)
     into: tuple[Any, ...] = (charge_w, discharge_w, engine_w, least_w, may_be_off)
     limits_of(
-        *plant, state.soc, state.engine_on, state.time_in_state_s, state.engine_power_w, *into
+        *plant,
+        state.soc,
+        state.engine_on,
+        state.time_in_state_s,
+        state.engine_power_w,
+        *into,
+        np.empty(batch),
     )
     return PowerLimits(*into)
 

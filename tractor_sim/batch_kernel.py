@@ -23,6 +23,9 @@ Segments: TypeAlias = NDArray[np.uint32]
 _COLUMNS, _Y, _SLOPE, _NEXT = np.uintp(4), np.uintp(1), np.uintp(2), np.uintp(1)
 """A knot takes four numbers: x, y, slope up to the next knot, nothing."""
 
+BLOCK = 256
+"""Plants that are stepped together: what they need fits a processor's first cache."""
+
 
 class Curve(NamedTuple):
     """Where a piecewise linear curve stands in the tables.
@@ -162,26 +165,27 @@ def limits_of(
     engine_w: FloatArray,
     engine_least_w: FloatArray,
     may_be_off: BoolArray,
+    ocv_v: FloatArray,
 ) -> None:
-    """Limits of B plants into the last five, every array of shape (B,)."""
-    for i in range(soc.size):
+    """Bounds of n plants into the last six, every array of shape (n,)."""
+    for i in range(np.uintp(soc.size)):
         b = bounds_of(
             plant, knots, segments, soc[i], engine_on[i], time_in_state_s[i], engine_power_w[i]
         )
         charge_w[i], discharge_w[i] = b.charge_w, b.discharge_w
         engine_w[i], engine_least_w[i] = b.engine_w, b.engine_least_w
-        may_be_off[i] = b.may_be_off
+        may_be_off[i], ocv_v[i] = b.may_be_off, b.ocv_v
 
 
 class Applied(NamedTuple):
-    """The next state of one plant and what the step applied, in the words of ``StepResult``."""
+    """The next state of one plant and what the step applied but its fuel, in the words of
+    ``StepResult``."""
 
     soc: float
     engine_on: bool
     time_in_state_s: float
     engine_power_w: float
     battery_power_w: float
-    fuel_kg: float
     started: bool
     shortfall_j: float
     dissipated_j: float
@@ -191,18 +195,15 @@ class Applied(NamedTuple):
 @njit(cache=True, error_model="numpy", forceinline=True)
 def advance(
     plant: Plant,
-    knots: FloatArray,
-    segments: Segments,
+    b: Bounds,
     soc: float,
     engine_on: bool,
     time_in_state_s: float,
-    engine_power_w: float,
     demand_w: float,
     command_battery_w: float,
     command_engine_w: float,
 ) -> Applied:
-    """``powertrain.step`` of one plant."""
-    b = bounds_of(plant, knots, segments, soc, engine_on, time_in_state_s, engine_power_w)
+    """``powertrain.step`` of one plant within its bounds, without the fuel."""
     floor_w = 0.0 if b.may_be_off else b.engine_least_w
     lb = _most(-b.charge_w, demand_w - b.engine_w)
     ub = _least(b.discharge_w, demand_w - floor_w)
@@ -219,14 +220,6 @@ def advance(
     imbalance_w = 0.0 if abs(imbalance_w) <= plant.rounding_w else imbalance_w
 
     started = (not off) & (not engine_on)
-    crank_w = _at(plant.crank_of_bus, knots, segments, engine_w)
-    of_curve = _at(plant.curve, knots, segments, crank_w)
-    burning = crank_w / (of_curve * plant.lhv_j_per_kg)
-    burning = of_curve if plant.fuel_curve else burning
-    fuel_kg = _most(burning, plant.idle_fuel_kg_per_s) * plant.dt_s
-    fuel_kg = 0.0 if off else fuel_kg
-    fuel_kg = fuel_kg + (plant.start_fuel_kg if started else 0.0)
-
     root_v = math.sqrt(_most(b.ocv_v * b.ocv_v - 4.0 * plant.resistance_ohm * battery_w, 0.0))
     spent = 2.0 * battery_w / (b.ocv_v + root_v) * plant.dt_s / plant.charge_c
     if plant.lossless:
@@ -239,12 +232,80 @@ def advance(
         (time_in_state_s if engine_on != off else 0.0) + plant.dt_s,
         engine_w,
         battery_w,
-        fuel_kg,
         started,
         _most(imbalance_w, 0.0) * plant.dt_s,
         _most(-imbalance_w, 0.0) * plant.dt_s,
         refused,
     )
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def fuel_of(
+    plant: Plant,
+    knots: FloatArray,
+    segments: Segments,
+    engine_w: float,
+    engine_on: bool,
+    started: bool,
+) -> float:
+    """Fuel of one step [kg], start fuel included."""
+    crank_w = _at(plant.crank_of_bus, knots, segments, engine_w)
+    of_curve = _at(plant.curve, knots, segments, crank_w)
+    burning = crank_w / (of_curve * plant.lhv_j_per_kg)
+    burning = of_curve if plant.fuel_curve else burning
+    fuel_kg = _most(burning, plant.idle_fuel_kg_per_s) * plant.dt_s
+    fuel_kg = fuel_kg if engine_on else 0.0
+    return fuel_kg + (plant.start_fuel_kg if started else 0.0)
+
+
+@njit(cache=True, error_model="numpy")
+def _step_block(
+    plant: Plant,
+    knots: FloatArray,
+    segments: Segments,
+    scratch: FloatArray,
+    may_be_off: BoolArray,
+    soc: FloatArray,
+    engine_on: BoolArray,
+    time_in_state_s: FloatArray,
+    engine_power_w: FloatArray,
+    demand_w: FloatArray,
+    command_battery_w: FloatArray,
+    command_engine_w: FloatArray,
+    battery_power_w: FloatArray,
+    applied_engine_w: FloatArray,
+    fuel_kg: FloatArray,
+    started: BoolArray,
+    shortfall_j: FloatArray,
+    dissipated_j: FloatArray,
+    refused: BoolArray,
+) -> None:
+    """One step of n <= BLOCK plants. Three loops, because a step is one long chain of results that
+    wait for each other: in a short loop the processor works on several plants at a time."""
+    charge_w, discharge_w, engine_w, least_w, ocv_v = scratch
+    limits_of(
+        plant, knots, segments, soc, engine_on, time_in_state_s, engine_power_w, charge_w,
+        discharge_w, engine_w, least_w, may_be_off, ocv_v,
+    )  # fmt: skip
+    for i in range(np.uintp(soc.size)):
+        b = Bounds(charge_w[i], discharge_w[i], engine_w[i], least_w[i], may_be_off[i], ocv_v[i])
+        r = advance(
+            plant,
+            b,
+            soc[i],
+            engine_on[i],
+            time_in_state_s[i],
+            demand_w[i],
+            command_battery_w[i],
+            command_engine_w[i],
+        )
+        soc[i], engine_on[i] = r.soc, r.engine_on
+        time_in_state_s[i], engine_power_w[i] = r.time_in_state_s, r.engine_power_w
+        battery_power_w[i], applied_engine_w[i] = r.battery_power_w, r.engine_power_w
+        started[i], refused[i] = r.started, r.refused
+        shortfall_j[i], dissipated_j[i] = r.shortfall_j, r.dissipated_j
+    for i in range(np.uintp(soc.size)):
+        fuel_kg[i] = fuel_of(plant, knots, segments, engine_power_w[i], engine_on[i], started[i])
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -271,24 +332,17 @@ def step_range(
 ) -> None:
     """One step of plants ``begin`` to ``end``; every array has shape (B,). The four state arrays
     are overwritten by the next state, the last seven by what was applied."""
-    for i in range(np.uintp(begin), np.uintp(end)):
-        r = advance(
-            plant,
-            knots,
-            segments,
-            soc[i],
-            engine_on[i],
-            time_in_state_s[i],
-            engine_power_w[i],
-            demand_w[i],
-            command_battery_w[i],
-            command_engine_w[i],
-        )
-        soc[i], engine_on[i] = r.soc, r.engine_on
-        time_in_state_s[i], engine_power_w[i] = r.time_in_state_s, r.engine_power_w
-        battery_power_w[i], applied_engine_w[i] = r.battery_power_w, r.engine_power_w
-        fuel_kg[i], started[i], refused[i] = r.fuel_kg, r.started, r.refused
-        shortfall_j[i], dissipated_j[i] = r.shortfall_j, r.dissipated_j
+    scratch, may_be_off = np.empty((5, BLOCK)), np.empty(BLOCK, dtype=np.bool_)
+    for first in range(begin, end, BLOCK):
+        last = min(first + BLOCK, end)
+        _step_block(
+            plant, knots, segments, scratch, may_be_off, soc[first:last],
+            engine_on[first:last], time_in_state_s[first:last], engine_power_w[first:last],
+            demand_w[first:last], command_battery_w[first:last], command_engine_w[first:last],
+            battery_power_w[first:last], applied_engine_w[first:last], fuel_kg[first:last],
+            started[first:last], shortfall_j[first:last], dissipated_j[first:last],
+            refused[first:last],
+        )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -313,24 +367,22 @@ def drive_range(
 ) -> None:
     """T steps of plants ``begin`` to ``end``. Demand and commands are (T, B), state and the sums
     that the last five are raised by (B,)."""
-    for t in range(demand_w.shape[0]):
-        for i in range(np.uintp(begin), np.uintp(end)):
-            r = advance(
-                plant,
-                knots,
-                segments,
-                soc[i],
-                engine_on[i],
-                time_in_state_s[i],
-                engine_power_w[i],
-                demand_w[t, i],
-                command_battery_w[t, i],
-                command_engine_w[t, i],
-            )
-            soc[i], engine_on[i] = r.soc, r.engine_on
-            time_in_state_s[i], engine_power_w[i] = r.time_in_state_s, r.engine_power_w
-            fuel_kg[i] += r.fuel_kg
-            starts[i] += r.started
-            shortfall_j[i] += r.shortfall_j
-            dissipated_j[i] += r.dissipated_j
-            refused[i] += r.refused
+    scratch, may_be_off = np.empty((5, BLOCK)), np.empty(BLOCK, dtype=np.bool_)
+    numbers, started, refusals = np.empty((5, BLOCK)), may_be_off.copy(), may_be_off.copy()
+    for first in range(begin, end, BLOCK):
+        last = min(first + BLOCK, end)
+        n = last - first
+        for t in range(demand_w.shape[0]):
+            _step_block(
+                plant, knots, segments, scratch, may_be_off, soc[first:last],
+                engine_on[first:last], time_in_state_s[first:last], engine_power_w[first:last],
+                demand_w[t, first:last], command_battery_w[t, first:last],
+                command_engine_w[t, first:last], numbers[0, :n], numbers[1, :n], numbers[2, :n],
+                started[:n], numbers[3, :n], numbers[4, :n], refusals[:n],
+            )  # fmt: skip
+            for i in range(n):
+                fuel_kg[first + i] += numbers[2, i]
+                starts[first + i] += started[i]
+                shortfall_j[first + i] += numbers[3, i]
+                dissipated_j[first + i] += numbers[4, i]
+                refused[first + i] += refusals[i]
