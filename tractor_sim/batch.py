@@ -214,21 +214,19 @@ def drive_batch(
 
 
 def limits_batch(plant: BatchPlant, state: PlantState) -> PowerLimits:
-    """``powertrain.power_limits`` of B plants."""
-    batch = len(state.soc)
-    charge_w, discharge_w, engine_w, least_w = (np.empty(batch) for _ in range(4))
-    may_be_off: BoolArray = np.empty(batch, dtype=bool)
-    into: tuple[Any, ...] = (charge_w, discharge_w, engine_w, least_w, may_be_off)
-    limits_of(
-        *plant,
-        state.soc,
-        state.engine_on,
-        state.time_in_state_s,
-        state.engine_power_w,
-        *into,
-        np.empty(batch),
-    )
-    return PowerLimits(*into)
+    """``powertrain.power_limits`` of B plants.
+
+    Raises:
+        ValueError: an array has another shape.
+    """
+    columns = (state.soc, state.engine_on, state.time_in_state_s, state.engine_power_w)
+    _check_shape(state.soc.shape, columns)
+    charge_w, discharge_w, engine_w, least_w, ocv_v = np.empty((5, len(state.soc)))
+    may_be_off: BoolArray = np.empty(len(state.soc), dtype=bool)
+    into: tuple[Any, ...] = (charge_w, discharge_w, engine_w, least_w, may_be_off, ocv_v)
+    arrays: tuple[Any, ...] = (*columns, *into)
+    limits_of(*plant, *arrays)
+    return PowerLimits(charge_w, discharge_w, engine_w, least_w, may_be_off)
 
 
 def _check_shape(shape: tuple[int, ...], columns: tuple[NDArray[Any], ...]) -> None:
