@@ -6,8 +6,8 @@ that price, and may move each start and stop a little.
 """
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +38,9 @@ choice is left, the co-state says what the last joule costs, not what energy is 
 
 GROWTH, PRICE_STEP, SEARCH_STEPS = 1.02, 1e-4, 50
 """Of the search for the factor on the price at which the plan ends where it should."""
+
+STRETCH_S = 1800.0
+"""Least length of the parts of a long cycle that are planned one after the other [s]."""
 
 SOC_MARGIN = 0.004
 """Kept off the window's ends where the relaxed optimum leaves no room there for ramps."""
@@ -84,7 +87,7 @@ def _plan(
     middle = float(np.median(price_kg))
     price_kg = np.clip(price_kg, middle / PRICE_SPREAD, middle * PRICE_SPREAD)
     chosen = np.empty(len(demand_w), dtype=np.int64)
-    on_kg, off_kg = _costs(params, levels, solution, price_kg)
+    on_kg, off_kg = _costs(params, levels, demand_w, relaxed.soc[:-1], price_kg)
     move = round(MOVE_S / params.dt_s)
     may_run, may_stand = _within(move, relaxed.engine_on), _within(move, ~relaxed.engine_on)
     priced_levels(
@@ -97,15 +100,98 @@ def _plan(
         chosen,
     )
     engine_on = chosen >= 0
+    plan_w, soc, short_j = np.zeros(len(demand_w)), float(relaxed.soc[0]), 0.0
+    for begin, end in _stretches(engine_on, round(STRETCH_S / params.dt_s)):
+        part = _Part(
+            params,
+            levels,
+            demand_w[begin:end],
+            relaxed.soc[begin:end],
+            price_kg[begin:end],
+            engine_on[begin:end],
+            soc,
+        )
+        target = solution.soc_target if end == len(demand_w) else float(relaxed.soc[end])
+        plan_w[begin:end] = part.that_ends(target)
+        soc, missed_j = part.end(plan_w[begin:end])
+        short_j += missed_j
+    return to_bus_w(params.generator, plan_w, engine.power_max_w), engine_on, short_j <= 0.0
 
-    def crank_w(factor: float) -> FloatArray:
-        costs_kg, _ = _costs(params, levels, solution, factor * price_kg)
-        levels_while(costs_kg, engine_on, levels.reach, chosen)
-        return np.where(engine_on, levels.crank_w[np.maximum(chosen, 0)], 0.0)
 
-    plan_w = _that_ends(params, solution, crank_w)
-    engine_w = to_bus_w(params.generator, plan_w, engine.power_max_w)
-    return engine_w, engine_on, _end(params, solution, plan_w)[1] <= 0.0
+def _stretches(engine_on: BoolArray, steps: int) -> list[tuple[int, int]]:
+    """The cycle in stretches of ``steps`` or more that begin with the engine off: a ramp limit
+    does not tie one to the next, so that each can be made to end at the SOC of the relaxed
+    optimum, and a long run does not drift away from it."""
+    begins = [0]
+    for k in np.flatnonzero(~engine_on).tolist():
+        if k - begins[-1] >= steps and len(engine_on) - k >= steps:
+            begins.append(k)
+    return list(itertools.pairwise([*begins, len(engine_on)]))
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A stretch of n steps: demand [W], SOC of the relaxed optimum before every step, price of
+    energy [kg per SOC] and on or off, each (n,); and where the plan is at its begin."""
+
+    params: PowertrainParams
+    levels: _Levels
+    power_demand_w: FloatArray
+    soc: FloatArray
+    price_kg: FloatArray
+    engine_on: BoolArray
+    soc_begin: float
+
+    def plan_w(self, factor: float) -> FloatArray:
+        """The best crankshaft powers (n,) at a multiple of the price [W]."""
+        costs_kg, _ = _costs(
+            self.params, self.levels, self.power_demand_w, self.soc, factor * self.price_kg
+        )
+        chosen = np.empty(len(self.soc), dtype=np.int64)
+        levels_while(costs_kg, self.engine_on, self.levels.reach, chosen)
+        return np.where(self.engine_on, self.levels.crank_w[np.maximum(chosen, 0)], 0.0)
+
+    def end(self, plan_w: FloatArray) -> tuple[float, float]:
+        """SOC at the end of a plan, and how much of the demand the battery fails to carry [J]."""
+        params = self.params
+        engine_w = to_bus_w(params.generator, plan_w, params.engine.power_max_w)
+        battery_w = self.power_demand_w - engine_w
+        soc, short_w = follow(model_of(params), battery_w, self.soc_begin)
+        return soc, short_w * params.dt_s
+
+    def that_ends(self, target: float | None) -> FloatArray:
+        """The plan (n,) [W] that ends at ``target``: between those of two prices of energy.
+
+        Any plan between two that keep to a ramp limit keeps to it too.
+        """
+        above = below = self.plan_w(1.0)
+        if target is None:
+            return above
+        low = high = 1.0
+        for _ in range(SEARCH_STEPS):
+            if self.end(above)[0] >= target:
+                break
+            low, below, high = high, above, high * GROWTH
+            above = self.plan_w(high)
+        for _ in range(SEARCH_STEPS):
+            if self.end(below)[0] <= target:
+                break
+            high, above, low = low, below, low / GROWTH
+            below = self.plan_w(low)
+        while high - low > PRICE_STEP:
+            middle = 0.5 * (low + high)
+            plan_w = self.plan_w(middle)
+            if self.end(plan_w)[0] >= target:
+                high, above = middle, plan_w
+            else:
+                low, below = middle, plan_w
+        share, step = 1.0, 0.5
+        for _ in range(SEARCH_STEPS):  # of ``above``, the least that ends at the target
+            if self.end(below + (share - step) * (above - below))[0] >= target:
+                share -= step
+            step *= 0.5
+        plan_w = below + share * (above - below)
+        return plan_w
 
 
 def _levels(params: PowertrainParams) -> _Levels:
@@ -122,16 +208,20 @@ def _levels(params: PowertrainParams) -> _Levels:
 
 
 def _costs(
-    params: PowertrainParams, levels: _Levels, solution: EngineSolution, price_kg: FloatArray
+    params: PowertrainParams,
+    levels: _Levels,
+    power_demand_w: FloatArray,
+    soc: FloatArray,
+    price_kg: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Cost of every step at every level (T, M) and with the engine off (T,): fuel, and what the
-    battery gives at ``price_kg`` (T,) per SOC, taken at the SOC of the relaxed optimum."""
-    battery, soc = params.battery, solution.plan.soc[:-1, None]
-    charge_w, discharge_w = power_limits_w(battery, soc, params.dt_s)
-    wanted_w = solution.power_demand_w[:, None] - np.append(0.0, levels.bus_w)
+    """Cost of n steps at every level (n, M) and with the engine off (n,): fuel, and what the
+    battery gives at ``price_kg`` (n,) per SOC, taken at ``soc`` (n,)."""
+    battery, wide_soc = params.battery, soc[:, None]
+    charge_w, discharge_w = power_limits_w(battery, wide_soc, params.dt_s)
+    wanted_w = power_demand_w[:, None] - np.append(0.0, levels.bus_w)
     power_w = np.clip(wanted_w, -charge_w, discharge_w)
-    soc = np.broadcast_to(soc, power_w.shape)
-    taken = discharge_current_a(battery, soc, power_w) * params.dt_s / battery.charge_c
+    wide_soc = np.broadcast_to(wide_soc, power_w.shape)
+    taken = discharge_current_a(battery, wide_soc, power_w) * params.dt_s / battery.charge_c
     cost_kg = taken * price_kg[:, None] + np.append(0.0, levels.fuel_kg)
     cost_kg += PENALTY_KG * 1e-3 * np.maximum(wanted_w - discharge_w - 1.0, 0.0)
     return np.ascontiguousarray(cost_kg[:, 1:]), np.ascontiguousarray(cost_kg[:, 0])
@@ -142,55 +232,6 @@ def _within(steps: int, state: BoolArray) -> BoolArray:
     padded = np.pad(state.astype(np.float64), steps)
     near: BoolArray = np.convolve(padded, np.ones(2 * steps + 1), mode="valid") > 0.5
     return near
-
-
-def _that_ends(
-    params: PowertrainParams, solution: EngineSolution, crank_w: Callable[[float], FloatArray]
-) -> FloatArray:
-    """The plan (T,) [W] that ends where it should: between those of two prices of energy.
-
-    Any plan between two that keep to a ramp limit keeps to it too.
-    """
-    target = solution.soc_target
-    above = below = crank_w(1.0)
-    if target is None:
-        return above
-    low = high = 1.0
-    for _ in range(SEARCH_STEPS):
-        if _end(params, solution, above)[0] >= target:
-            break
-        high *= GROWTH
-        above = crank_w(high)
-    for _ in range(SEARCH_STEPS):
-        if _end(params, solution, below)[0] <= target:
-            break
-        low /= GROWTH
-        below = crank_w(low)
-    while high - low > PRICE_STEP:
-        middle = 0.5 * (low + high)
-        plan_w = crank_w(middle)
-        if _end(params, solution, plan_w)[0] >= target:
-            high, above = middle, plan_w
-        else:
-            low, below = middle, plan_w
-    share, step = 1.0, 0.5
-    for _ in range(SEARCH_STEPS):  # of ``above``, the least that ends at the target
-        if _end(params, solution, below + (share - step) * (above - below))[0] >= target:
-            share -= step
-        step *= 0.5
-    plan_w = below + share * (above - below)
-    return plan_w
-
-
-def _end(
-    params: PowertrainParams, solution: EngineSolution, crank_w: FloatArray
-) -> tuple[float, float]:
-    """SOC at the end of a plan, and how much the battery fails to carry [J]."""
-    engine_w = to_bus_w(params.generator, crank_w, params.engine.power_max_w)
-    soc = float(solution.plan.soc[0])
-    battery_w = solution.power_demand_w - engine_w
-    soc_end, short_w = follow(model_of(params), battery_w, soc)
-    return soc_end, short_w * params.dt_s
 
 
 def _with_margin(params: PowertrainParams, solution: EngineSolution) -> EngineSolution:
