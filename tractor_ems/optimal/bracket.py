@@ -26,8 +26,17 @@ from tractor_sim.powertrain import PowertrainParams
 LEVELS = 110
 """About how many engine powers are told apart: 2.5 kW on "field"."""
 
-MOVE_S = 10.0
-"""How far a start or stop may be moved [s]."""
+TRIES = ((10.0, 0.0), (0.0, 0.0), (3.0, 0.0), (10.0, 0.004), (0.0, 0.004), (10.0, 0.015))
+"""How far a start or stop may be moved [s], and how far the optimum that is followed keeps off the
+ends of the SOC window. Where it uses the whole window, moving a stop may leave no room to end as
+it should."""
+
+GOOD_ENOUGH = 1e-3
+"""No more is tried once a plan is that close to the relaxed optimum."""
+
+MISSED = 1.5
+"""Price of energy missing at the end in units of what it is worth: a plan that ends as it should
+is preferred."""
 
 PENALTY_KG = 10.0
 """Price of a step in a state that the schedule does not allow, and of 1 kW of unmet demand."""
@@ -41,9 +50,6 @@ GROWTH, PRICE_STEP, SEARCH_STEPS = 1.02, 1e-4, 50
 
 STRETCH_S = 1800.0
 """Least length of the parts of a long cycle that are planned one after the other [s]."""
-
-SOC_MARGIN = 0.004
-"""Kept off the window's ends where the relaxed optimum leaves no room there for ramps."""
 
 
 @dataclass(frozen=True)
@@ -66,29 +72,41 @@ def drive_plan(params: PowertrainParams, solution: EngineSolution) -> Trajectory
 
 
 def plan_policy(params: PowertrainParams, solution: EngineSolution) -> PlannedPolicy:
-    """The optimum as the real plant can drive it."""
-    engine_w, engine_on, met = _plan(params, solution)
-    if not met:
-        solution = _with_margin(params, solution)
-        engine_w, engine_on, _ = _plan(params, solution)
-    return PlannedPolicy(params, solution.power_demand_w, engine_w, engine_on)
+    """The optimum as the real plant can drive it: the cheapest of a few plans."""
+    engine, relaxed = params.engine, solution.plan
+    demand_w, engine_w, engine_on = (
+        solution.power_demand_w,
+        relaxed.engine_power_w,
+        relaxed.engine_on,
+    )
+    if math.isinf(engine.ramp_w_per_s) and engine.min_on_s == engine.min_off_s == 0.0:
+        return PlannedPolicy(params, demand_w, engine_w, engine_on)
+    enough_kg = solution.cost_kg * (1.0 + GOOD_ENOUGH)
+    least_kg, followed = math.inf, solution
+    for move_s, margin in TRIES:
+        if margin > 0.0:
+            followed = _with_margin(params, solution, margin)
+        cost_kg, power_w, on = _plan(params, followed, move_s)
+        if cost_kg < least_kg:
+            least_kg, engine_w, engine_on = cost_kg, power_w, on
+        if least_kg <= enough_kg:
+            break
+    return PlannedPolicy(params, demand_w, engine_w, engine_on)
 
 
 def _plan(
-    params: PowertrainParams, solution: EngineSolution
-) -> tuple[FloatArray, BoolArray, bool]:
-    """Engine power at the bus and on or off (T,), and whether the battery can carry the rest."""
-    relaxed, demand_w = solution.plan, solution.power_demand_w
-    engine = params.engine
-    if math.isinf(engine.ramp_w_per_s) and engine.min_on_s == engine.min_off_s == 0.0:
-        return relaxed.engine_power_w, relaxed.engine_on, True
+    params: PowertrainParams, solution: EngineSolution, move_s: float
+) -> tuple[float, FloatArray, BoolArray]:
+    """A plan that moves starts and stops by ``move_s`` at most: what it costs with unmet demand
+    and a missed end priced [kg], engine power at the bus and on or off (T,)."""
+    relaxed, demand_w, engine = solution.plan, solution.power_demand_w, params.engine
     levels = _levels(params)
     price_kg = solution.co_state_kg_per_j * params.battery.energy_j
     middle = float(np.median(price_kg))
     price_kg = np.clip(price_kg, middle / PRICE_SPREAD, middle * PRICE_SPREAD)
     chosen = np.empty(len(demand_w), dtype=np.int64)
     on_kg, off_kg = _costs(params, levels, demand_w, relaxed.soc[:-1], price_kg)
-    move = round(MOVE_S / params.dt_s)
+    move = round(move_s / params.dt_s)
     may_run, may_stand = _within(move, relaxed.engine_on), _within(move, ~relaxed.engine_on)
     priced_levels(
         on_kg + PENALTY_KG * ~may_run[:, None],
@@ -115,7 +133,12 @@ def _plan(
         plan_w[begin:end] = part.that_ends(target)
         soc, missed_j = part.end(plan_w[begin:end])
         short_j += missed_j
-    return to_bus_w(params.generator, plan_w, engine.power_max_w), engine_on, short_j <= 0.0
+    burning = fuel_rate_kg_per_s(engine, plan_w, engine_on) * params.dt_s
+    starts = int(np.sum(engine_on & ~np.append(False, engine_on[:-1])))
+    cost_kg = float(burning.sum()) + starts * engine.start_fuel_kg + PENALTY_KG * 1e-3 * short_j
+    wanted = float(relaxed.soc[-1]) if solution.soc_target is None else solution.soc_target
+    cost_kg += middle * max(wanted - soc, 0.0) * MISSED
+    return cost_kg, to_bus_w(params.generator, plan_w, engine.power_max_w), engine_on
 
 
 def _stretches(engine_on: BoolArray, steps: int) -> list[tuple[int, int]]:
@@ -234,14 +257,16 @@ def _within(steps: int, state: BoolArray) -> BoolArray:
     return near
 
 
-def _with_margin(params: PowertrainParams, solution: EngineSolution) -> EngineSolution:
+def _with_margin(
+    params: PowertrainParams, solution: EngineSolution, margin: float
+) -> EngineSolution:
     """The optimum that keeps off the ends of the battery's window."""
     battery = params.battery
     ends = [float(solution.plan.soc[0]), float(solution.plan.soc[-1])]
     inside = dataclasses.replace(
         battery,
-        soc_min=min(battery.soc_min + SOC_MARGIN, *ends),
-        soc_max=max(battery.soc_max - SOC_MARGIN, *ends),
+        soc_min=min(battery.soc_min + margin, *ends),
+        soc_max=max(battery.soc_max - margin, *ends),
     )
     return solve_engine(
         dataclasses.replace(params, battery=inside),
