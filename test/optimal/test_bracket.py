@@ -62,8 +62,11 @@ def check_limits_kept(params: PowertrainParams, run: Trajectory) -> None:
     ("params", "demand_w"),
     [
         (FIELD, jumping_w()),
-        (with_engine(start_fuel_kg=0.0), generated_w("loader", 3)),
-        (with_engine(ramp_w_per_s=20e3, min_on_s=20.0, min_off_s=30.0), generated_w("loader", 3)),
+        (with_engine(start_fuel_kg=0.0), generated_w("loader", 3, 300)),
+        (
+            with_engine(ramp_w_per_s=20e3, min_on_s=20.0, min_off_s=30.0),
+            generated_w("loader", 3, 300),
+        ),
     ],
 )
 def test_the_plan_fits_ramp_and_minimum_times_and_ends_where_it_should(params, demand_w):
@@ -88,7 +91,7 @@ def test_an_engine_that_is_slow_is_started_before_the_battery_is_at_its_limit():
 
 @pytest.mark.parametrize("operation", ["loader", "baler"])
 def test_the_certificate_holds_on_generated_work(operation):
-    certificate = certify(FIELD, generated_w(operation, 5), 0.55, 0.55)
+    certificate = certify(FIELD, generated_w(operation, 5, 300), 0.55, 0.55)
     assert certificate.ok
     assert certificate.grid_halving_change < HALVING_LIMIT
     assert abs(certificate.rollout_gap) <= ROLLOUT_LIMIT
@@ -98,7 +101,7 @@ def test_the_certificate_holds_on_generated_work(operation):
 
 
 def test_without_ramp_and_minimum_times_the_bracket_is_closed():
-    certificate = certify(relaxed(FIELD), generated_w("loader", 5, 300), 0.55, 0.55)
+    certificate = certify(relaxed(FIELD), generated_w("loader", 5, 120), 0.55, 0.55)
     assert certificate.bracket_width == pytest.approx(0.0, abs=2e-5)
 
 

@@ -113,7 +113,7 @@ def least_fuel_by_enumeration(
 def test_dp_equals_enumeration_of_schedules_and_powers(demand_kw, gained_j, start_fuel_kg):
     params, demand_w = starting_for(start_fuel_kg), 1e3 * np.array(demand_kw, dtype=float)
     target = 0.55 + gained_j / ENERGY_J
-    powers = 18 if len(demand_w) == 4 else 90
+    powers = 18 if len(demand_w) == 4 else 60
     expected = least_fuel_by_enumeration(params, demand_w, 0.55, target, powers)
     found = solve_engine(params, demand_w, 0.55, target)
     assert found.lower_bound_kg == pytest.approx(expected, rel=4e-4)

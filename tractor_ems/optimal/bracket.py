@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from tractor_ems.drive import drive
-from tractor_ems.optimal.engine_dp import EngineSolution, model_of, solve_engine
-from tractor_ems.optimal.engine_kernel import follow
+from tractor_ems.optimal.engine_dp import EnginePlan, EngineSolution, model_of, solve_engine
+from tractor_ems.optimal.engine_kernel import Model
+from tractor_ems.optimal.engine_reach import follow
 from tractor_ems.optimal.ramp_kernel import levels_while, priced_levels
 from tractor_ems.policies.planned import PlannedPolicy
 from tractor_msgs_py.trajectory import BoolArray, FloatArray, Trajectory
@@ -85,6 +86,8 @@ def plan_policy(params: PowertrainParams, solution: EngineSolution) -> PlannedPo
     least_kg, followed = math.inf, solution
     for move_s, margin in TRIES:
         if margin > 0.0:
+            if _room(params, relaxed) > margin:
+                continue
             followed = _with_margin(params, solution, margin)
         cost_kg, power_w, on = _plan(params, followed, move_s)
         if cost_kg < least_kg:
@@ -94,13 +97,19 @@ def plan_policy(params: PowertrainParams, solution: EngineSolution) -> PlannedPo
     return PlannedPolicy(params, demand_w, engine_w, engine_on)
 
 
+def _room(params: PowertrainParams, plan: EnginePlan) -> float:
+    """How far the optimum stays off the ends of the SOC window."""
+    battery, soc = params.battery, plan.soc
+    return min(float(soc.min()) - battery.soc_min, battery.soc_max - float(soc.max()))
+
+
 def _plan(
     params: PowertrainParams, solution: EngineSolution, move_s: float
 ) -> tuple[float, FloatArray, BoolArray]:
     """A plan that moves starts and stops by ``move_s`` at most: what it costs with unmet demand
     and a missed end priced [kg], engine power at the bus and on or off (T,)."""
     relaxed, demand_w, engine = solution.plan, solution.power_demand_w, params.engine
-    levels = _levels(params)
+    levels, model = _levels(params), model_of(params)
     price_kg = solution.co_state_kg_per_j * params.battery.energy_j
     middle = float(np.median(price_kg))
     price_kg = np.clip(price_kg, middle / PRICE_SPREAD, middle * PRICE_SPREAD)
@@ -122,6 +131,7 @@ def _plan(
     for begin, end in _stretches(engine_on, round(STRETCH_S / params.dt_s)):
         part = _Part(
             params,
+            model,
             levels,
             demand_w[begin:end],
             relaxed.soc[begin:end],
@@ -158,6 +168,7 @@ class _Part:
     energy [kg per SOC] and on or off, each (n,); and where the plan is at its begin."""
 
     params: PowertrainParams
+    model: Model
     levels: _Levels
     power_demand_w: FloatArray
     soc: FloatArray
@@ -179,7 +190,7 @@ class _Part:
         params = self.params
         engine_w = to_bus_w(params.generator, plan_w, params.engine.power_max_w)
         battery_w = self.power_demand_w - engine_w
-        soc, short_w = follow(model_of(params), battery_w, self.soc_begin)
+        soc, short_w = follow(self.model, battery_w, self.soc_begin)
         return soc, short_w * params.dt_s
 
     def that_ends(self, target: float | None) -> FloatArray:

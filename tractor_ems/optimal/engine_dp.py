@@ -19,11 +19,10 @@ from tractor_ems.optimal.engine_kernel import (
     backward,
     co_states,
     forward,
-    of_use,
-    reachable,
     row_of,
     value_at,
 )
+from tractor_ems.optimal.engine_reach import of_use, reachable
 from tractor_ems.policies.planned import command
 from tractor_msgs_py.errors import ConfigError, CycleError
 from tractor_msgs_py.trajectory import BoolArray, FloatArray
