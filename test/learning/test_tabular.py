@@ -77,6 +77,7 @@ def assert_equal_agents(one: TabularAgent, other: TabularAgent) -> None:
     assert one.state_visits.tobytes() == other.state_visits.tobytes()
 
 
+@pytest.mark.slow
 def test_soc_leaves_its_bin_although_no_step_moves_it_by_a_tenth_of_one():
     """A table that snapped SOC to its bin centres would stay where it started."""
     demand_w = np.full(400, 200e3)  # more than a battery at 0.85 gives for long

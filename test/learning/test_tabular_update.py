@@ -250,6 +250,7 @@ def maximisation_bias(tables, noise, rng):
     return left
 
 
+@pytest.mark.slow
 def test_double_q_goes_left_less_often_in_the_example_of_sutton_and_barto():
     """Left is worth -0.1, and the best policy with this exploration takes it in 5 % of the
     episodes. Over 100 episodes and 1,000 seeds Q-learning takes it at least 40 points more often

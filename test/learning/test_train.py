@@ -79,6 +79,7 @@ def test_same_seed_same_bytes_and_another_seed_others(mode: str, bags: Path, tmp
     )
 
 
+@pytest.mark.slow
 def test_resumed_runs_equal_unbroken_ones_to_the_byte(bags: Path, tmp_path: Path):
     """Interrupted after 30 of 60 updates, resumed in a process of its own; both modes."""
     for mode in CONFIGS:
@@ -195,6 +196,7 @@ def test_the_size_of_a_spike_of_demand_changes_no_weight(make_traces, paper, tmp
         assert network(-1e14, mode) == network(-1e9, mode)
 
 
+@pytest.mark.slow
 def test_the_order_and_names_of_bags_decide_nothing(bags: Path, tmp_path: Path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()

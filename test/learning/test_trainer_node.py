@@ -79,6 +79,7 @@ def wait_for(condition: Callable[[], bool], what: str) -> None:
         assert time.monotonic() < deadline, f"timed out waiting for {what}"
 
 
+@pytest.mark.slow
 def test_trainer_tells_its_progress_and_exits_0_when_done(
     bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -120,6 +121,7 @@ def test_sigterm_leaves_a_checkpoint_and_exits_0(
     assert "Traceback" not in log.read_text()
 
 
+@pytest.mark.slow
 def test_sigterm_exits_2_where_the_checkpoint_cannot_be_written(
     bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

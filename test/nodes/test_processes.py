@@ -38,7 +38,9 @@ def planter_hash(policy) -> str:
     return trajectory_hash(trajectory)
 
 
-@pytest.mark.parametrize("executable", ["rule_based_policy", "ddqn_policy"])
+@pytest.mark.parametrize(
+    "executable", [pytest.param("rule_based_policy", marks=pytest.mark.slow), "ddqn_policy"]
+)
 def test_plant_and_policy_started_by_hand_in_either_order_drive_the_planter(start, executable):
     expected = planter_hash(default_policy(executable))[:16]
     node = start(executable)

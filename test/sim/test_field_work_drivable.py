@@ -25,6 +25,7 @@ def test_an_engine_that_never_stops_delivers_every_cycle_within_the_battery():
         assert abs(run.soc_final - 0.55) < 0.1, name
 
 
+@pytest.mark.slow
 def test_both_pictures_are_written_and_small(tmp_path, monkeypatch):
     monkeypatch.setattr(plots_cycles, "SEEDS", range(1, 3))
     plots_cycles.plot_measured_jobs(tmp_path / "a.png")

@@ -15,7 +15,7 @@ from tractor_ems.learning.mdp import (
 )
 from tractor_ems.learning.mdp import reward_of as compiled_reward
 from tractor_ems.learning.rewards import RewardKind
-from tractor_ems.policies.rules import BestPoint, Conventional
+from tractor_ems.policies.rules import BestPoint, Conventional, RuleBased
 from tractor_ems.study.baselines import (
     REWARDS,
     SOC_MINS,
@@ -34,6 +34,9 @@ from tractor_sim.powertrain import PowertrainParams
 PAPER = load_powertrain("paper")
 PLANTER_W = load_cycle("planter").power_demand_w
 SHORT_W = PLANTER_W[40:160]
+FOLLOWS_THE_LOAD = RuleBased(PAPER, threshold_w=0.0, soc_guard=False)
+"""An engine that carries every load alone and is off where there is none."""
+
 IDS = (
     "conventional",
     "dp",
@@ -164,7 +167,7 @@ def test_myopic_takes_the_best_action_of_the_learners_own_environment(
 
 def test_an_outcome_tells_how_the_engine_ran():
     demand_w = np.array([[50e3, 50e3, 0.0, 100e3, 150e3]])
-    run = drive(Conventional(), PAPER, demand_w, 0.85, 0.836)[0]
+    run = drive(FOLLOWS_THE_LOAD, PAPER, demand_w, 0.85, 0.836)[0]
     outcome = outcome_of(run, PAPER, reward_config("piecewise"))
     assert outcome.engine_on_s == 4.0
     assert outcome.below_60kw_share == 0.5
@@ -176,7 +179,7 @@ def test_an_outcome_tells_how_the_engine_ran():
 
 
 def test_a_drive_without_the_engine_has_no_efficiency_and_no_share():
-    run = drive(Conventional(), PAPER, np.zeros((1, 3)), 0.85, 0.836)[0]
+    run = drive(FOLLOWS_THE_LOAD, PAPER, np.zeros((1, 3)), 0.85, 0.836)[0]
     outcome = outcome_of(run, PAPER, reward_config("fuel"))
     assert outcome.efficiency is None
     assert outcome.below_60kw_share is None

@@ -37,6 +37,7 @@ SPEED = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("text", "fast", "slow"), SPEED)
 def test_a_speed_claim_holds_fails_when_swapped_and_stays_open_when_even(text, fast, slow):
     soon, late = {"converges_at": 0.2}, {"converges_at": 0.6}

@@ -54,7 +54,7 @@ def stop_after(pieces: int):
         pytest.param("dqn", marks=pytest.mark.slow),
         pytest.param("ddqn_soft_target", marks=pytest.mark.slow),
         pytest.param("ddqn_shaped_dp", marks=pytest.mark.slow),
-        "ddqn_shaped_dp_margin",
+        pytest.param("ddqn_shaped_dp_margin", marks=pytest.mark.slow),
         pytest.param("q", marks=pytest.mark.slow),
         "double_q",
         pytest.param("double_q_interpolated", marks=pytest.mark.slow),
@@ -92,6 +92,7 @@ run.execute(task_of(tiny("ddqn_shaped", actions=65), Path(sys.argv[1])), report=
 """
 
 
+@pytest.mark.slow
 def test_a_killed_and_resumed_run_gives_the_same_bytes(tmp_path: Path) -> None:
     config = tiny("ddqn_shaped", actions=65)
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
@@ -155,7 +156,9 @@ def test_seeds_of_a_run_decide_it_and_names_do_not(tmp_path: Path) -> None:
     assert config_hash(more_seeds, row, 0) == digest, "seed 0 is the same run in a larger study"
 
 
-@pytest.mark.parametrize(("replay", "kept"), [("fifo", 0), ("kept", 2000)])
+@pytest.mark.parametrize(
+    ("replay", "kept"), [pytest.param("fifo", 0, marks=pytest.mark.slow), ("kept", 2000)]
+)
 def test_seeds_are_overwritten_in_a_fifo_and_stay_where_they_are_kept(
     replay: str, kept: int, tmp_path: Path
 ) -> None:

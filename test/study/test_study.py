@@ -21,6 +21,7 @@ def without_baselines(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tractor_ems.study.study.make_baselines", lambda *args, **kwargs: ())
 
 
+@pytest.mark.slow
 def test_a_study_counts_its_sittings_and_a_second_call_trains_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -89,6 +90,7 @@ def test_a_folder_that_cannot_be_is_refused_before_any_work(below: str, tmp_path
         run_study(tiny("q"), out / below if below == "study" else out, workers=1, stage=quiet)
 
 
+@pytest.mark.slow
 def test_sittings_that_are_damaged_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

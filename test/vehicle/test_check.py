@@ -172,6 +172,7 @@ def test_bridging_power_is_what_the_plant_needs_at_a_measured_pass_start():
     assert np.maximum(run.battery_power_w, 0.0).sum() == pytest.approx(needed_j)
 
 
+@pytest.mark.slow
 def test_the_command_prints_one_document_and_draws(tmp_path, capsys):
     picture = tmp_path / "curves.png"
     assert main(["vehicle", "check", "field", "--plot", str(picture), "--json"]) == 0
