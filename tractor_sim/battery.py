@@ -12,6 +12,7 @@ import numpy as np
 
 from tractor_msgs_py.errors import ConfigError
 from tractor_msgs_py.trajectory import FloatArray
+from tractor_sim.knots import check_entries, check_rising
 
 
 @dataclass(frozen=True)
@@ -64,18 +65,20 @@ class BatteryParams:
         soc, volts = np.array(self.ocv_soc), np.array(self.ocv_v)
         if len(soc) != len(volts) or len(soc) == 1:
             raise ConfigError(
-                f"battery.ocv_soc: {len(soc)} SOC, {len(volts)} voltages, allowed none or at "
-                "least 2 of each in equal number"
+                f"battery.ocv_soc, ocv_v: {len(soc)} SOC, {len(volts)} voltages, allowed none or "
+                "at least 2 of each in equal number"
             )
         if not len(soc):
             return
-        if not np.all(np.diff(soc) > 0) or soc[0] > self.soc_min or soc[-1] < self.soc_max:
+        check_rising("battery.ocv_soc", soc)
+        if soc[0] > self.soc_min or soc[-1] < self.soc_max:
             raise ConfigError(
-                f"battery.ocv_soc: {soc[0]}..{soc[-1]}, must increase and cover the window "
-                f"{self.soc_min}..{self.soc_max}"
+                f"battery.ocv_soc: {soc[0]}..{soc[-1]}, allowed what covers the window soc_min.."
+                f"soc_max, {self.soc_min}..{self.soc_max}"
             )
-        if not (np.all(np.isfinite(volts)) and volts[0] > 0 and np.all(np.diff(volts) >= 0)):
-            raise ConfigError("battery.ocv_v: must be finite, > 0 and never fall with SOC")
+        good = np.isfinite(volts) & (volts > 0)
+        check_entries("battery.ocv_v", volts, good, "finite and > 0")
+        check_rising("battery.ocv_v", volts, level=True)
 
     @property
     def charge_c(self) -> float:

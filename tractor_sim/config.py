@@ -10,11 +10,13 @@ from typing import Annotated, Any
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from tractor_msgs_py.errors import ConfigError
+from tractor_sim.engine import check_fuel_knots
 from tractor_sim.fuel_curve import convex_fuel_curve
 from tractor_sim.generator import GeneratorParams
+from tractor_sim.knots import check_entries, check_rising
 from tractor_sim.powertrain import PowertrainParams
 from tractor_sim.powertrain_json import params_from_json
 from tractor_sim.resources import resource_path
@@ -38,14 +40,6 @@ class _FuelCurve(_Strict):
     power_w: Annotated[tuple[NotNegative, ...], Field(min_length=2)]
     fuel_kg_per_s: Annotated[tuple[NotNegative, ...], Field(min_length=2)]
 
-    @model_validator(mode="after")
-    def _pairs(self) -> "_FuelCurve":
-        if len(self.power_w) != len(self.fuel_kg_per_s):
-            raise ValueError(f"{len(self.power_w)} powers, {len(self.fuel_kg_per_s)} fuel rates")
-        if not np.all(np.diff(self.power_w) > 0):
-            raise ValueError("power_w must increase")
-        return self
-
 
 class _Engine(_Strict):
     """Either an efficiency curve, or fuel curves of which ``curve`` names the one in use."""
@@ -62,23 +56,10 @@ class _Engine(_Strict):
     min_off_s: NotNegative = 0.0
     ramp_w_per_s: Positive | None = None
 
-    @model_validator(mode="after")
-    def _one_kind(self) -> "_Engine":
-        if bool(self.curves) == bool(self.curve_power_w):
-            raise ValueError("give either curve_power_w with curve_efficiency, or curves")
-        if self.curves and self.curve not in self.curves:
-            raise ValueError(f"curve is {self.curve!r}, curves has {', '.join(self.curves)}")
-        if self.curves and self.curves[self.curve].power_w[-1] != self.power_max_w:
-            raise ValueError(
-                f"curves.{self.curve}.power_w ends at {self.curves[self.curve].power_w[-1]}, "
-                f"power_max_w is {self.power_max_w}"
-            )
-        return self
-
 
 class _Generator(_Strict):
     load_fraction: tuple[Fraction, ...] = (0.0, 1.0)
-    curve_efficiency: tuple[Fraction, ...] = (1.0, 1.0)
+    curve_efficiency: tuple[Annotated[float, Field(gt=0, le=1)], ...] = (1.0, 1.0)
 
 
 class _Battery(_Strict):
@@ -123,6 +104,7 @@ def load_powertrain(name_or_path: str | Path) -> PowertrainParams:
     except ValidationError as error:
         raise ConfigError(f"{found}: {describe(error)}") from None
     try:
+        _check_curves(checked.engine)
         params = params_from_json(_resolved(checked.model_dump(mode="json")))
     except ConfigError as error:
         raise ConfigError(f"{found}: {error}") from None
@@ -163,6 +145,57 @@ def read_powertrain(name_or_path: str) -> tuple[str, Any]:
     return f"{path}:{settings}", document
 
 
+def _check_curves(engine: _Engine) -> None:
+    """What the schema cannot say of the curves, because it takes several fields to see it.
+
+    Raises:
+        ConfigError: the message names the field as the file does, its value and what is allowed.
+    """
+    plain = bool(engine.curve_power_w or engine.curve_efficiency)
+    if bool(engine.curves) == plain:
+        raise ConfigError(
+            f"engine.curves, engine.curve_power_w: {'both' if plain else 'none'} given, allowed "
+            "either curves or curve_power_w with curve_efficiency"
+        )
+    for name, curve in engine.curves.items():
+        field = f"engine.curves.{name}"
+        if len(curve.power_w) != len(curve.fuel_kg_per_s):
+            raise ConfigError(
+                f"{field}.power_w: {len(curve.power_w)} entries, allowed as many as "
+                f"fuel_kg_per_s has, {len(curve.fuel_kg_per_s)}"
+            )
+        check_rising(f"{field}.power_w", curve.power_w)
+    if plain:
+        return
+    if engine.curve not in engine.curves:
+        names = ", ".join(engine.curves)
+        raise ConfigError(f"engine.curve: {_shown(engine.curve)}, allowed {names}")
+    _check_curve_in_use(engine, f"engine.curves.{engine.curve}", engine.curves[engine.curve])
+
+
+def _check_curve_in_use(engine: _Engine, field: str, curve: _FuelCurve) -> None:
+    """Refuse a fuel curve whose convex hull would not rise or would pass an efficiency of 1."""
+    power_w, fuel = np.array(curve.power_w), np.array(curve.fuel_kg_per_s)
+    if power_w[-1] != engine.power_max_w:
+        raise ConfigError(
+            f"{field}.power_w.{len(power_w) - 1}: {power_w[-1]}, allowed engine.power_max_w, "
+            f"{engine.power_max_w}"
+        )
+    check_fuel_knots(f"{field}.fuel_kg_per_s", power_w, fuel, engine.fuel_lhv_j_per_kg)
+    if power_w[0] > 0.0:
+        idle = engine.idle_fuel_kg_per_s
+        if idle >= fuel[0]:
+            raise ConfigError(
+                f"engine.idle_fuel_kg_per_s: {idle}, allowed 0 <= value < {fuel[0]}, "
+                f"{field}.fuel_kg_per_s at its first power, {power_w[0]:g} W"
+            )
+    else:
+        idle = float(fuel[0])
+    above = fuel > idle
+    above[0] = True
+    check_entries(f"{field}.fuel_kg_per_s", fuel, above, f"> {idle}, the fuel rate at 0 W")
+
+
 def _resolved(document: dict[str, Any]) -> dict[str, Any]:
     """The checked document in the terms of the parameters: the fuel curve in use, made convex."""
     engine = document["engine"]
@@ -181,12 +214,26 @@ def _resolved(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def describe(error: ValidationError) -> str:
-    """The first problem of a validation error in one line: field, problem, value."""
-    first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"]) or "document"
+    """One problem of a validation error in one line: field, problem, value.
+
+    It is the first unknown key, which is often a missing one misspelt, or else the first problem.
+    """
+    problems = error.errors()
+    unknown = (item for item in problems if item["type"] == "extra_forbidden")
+    first = next(unknown, problems[0])
+    where = ".".join(str(part) for part in first["loc"]) or "the document"
     more = error.error_count() - 1
-    shown = _shown(first["input"])
-    return f"{where}: {first['msg']} (got {shown})" + (f", {more} more" if more else "")
+    value, problem = first["input"], first["msg"].removeprefix("Value error, ")
+    if first["type"] == "missing":
+        text = f"{where}: is missing, a value is required"
+    elif first["type"] in ("model_type", "dict_type"):
+        got = "nothing" if value is None else _shown(value)
+        text = f"{where}: {got}, allowed a mapping of names to values"
+    elif first["type"] == "value_error" and isinstance(value, dict | BaseModel):
+        text = f"{where}: {problem}"  # of several fields, which the problem names
+    else:
+        text = f"{where}: {problem} (got {_shown(value)})"
+    return text + (f", {more} more" if more else "")
 
 
 def _shown(value: object) -> str:

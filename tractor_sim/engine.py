@@ -10,6 +10,10 @@ import numpy as np
 
 from tractor_msgs_py.errors import ConfigError
 from tractor_msgs_py.trajectory import BoolArray, FloatArray
+from tractor_sim.knots import check_entries, check_rising
+
+TIME_ROUNDING_S = 1e-6
+"""A time in state is a sum of steps: this much below a minimum time is rounding."""
 
 
 @dataclass(frozen=True)
@@ -58,28 +62,47 @@ class EngineParams:
         eta = np.array(self.curve_efficiency)
         name, values = ("fuel rates", fuel) if len(fuel) else ("efficiencies", eta)
         if len(fuel) and len(eta):
-            raise ConfigError("engine.curve_efficiency, curve_fuel_kg_per_s: only one is allowed")
+            raise ConfigError(
+                "engine.curve_efficiency, curve_fuel_kg_per_s: both given, allowed one"
+            )
         if len(power) < 2 or len(power) != len(values):
             raise ConfigError(
                 f"engine.curve_power_w: {len(power)} powers, {len(values)} {name}, "
                 "at least 2 of each in equal number"
             )
-        if power[0] != 0.0 or not np.all(np.diff(power) > 0):
-            raise ConfigError("engine.curve_power_w: must start at 0 and increase")
+        if power[0] != 0.0:
+            raise ConfigError(f"engine.curve_power_w.0: {float(power[0])}, allowed 0")
+        check_rising("engine.curve_power_w", power)
         if power[-1] != self.power_max_w:
             raise ConfigError(
-                f"engine.curve_power_w: ends at {power[-1]} W, power_max_w is {self.power_max_w}"
+                f"engine.curve_power_w.{len(power) - 1}: {float(power[-1])}, allowed "
+                f"engine.power_max_w, {self.power_max_w}"
             )
         if not len(fuel):
-            if not np.all((eta > 0) & (eta < 1)):
-                raise ConfigError("engine.curve_efficiency: every value must lie in 0 < value < 1")
+            good = (eta > 0) & (eta < 1)
+            check_entries("engine.curve_efficiency", eta, good, "0 < value < 1")
             return
-        least = power / self.fuel_lhv_j_per_kg
-        if not (np.all(np.diff(fuel) > 0) and fuel[0] >= 0 and np.all(fuel[1:] > least[1:])):
-            raise ConfigError(
-                "engine.curve_fuel_kg_per_s: must increase from >= 0 and be more than "
-                "power / fuel_lhv_j_per_kg (an efficiency below 1)"
-            )
+        check_fuel_knots("engine.curve_fuel_kg_per_s", power, fuel, self.fuel_lhv_j_per_kg)
+        check_rising("engine.curve_fuel_kg_per_s", fuel)
+
+
+def check_fuel_knots(
+    field: str, power_w: FloatArray, fuel_kg_per_s: FloatArray, fuel_lhv_j_per_kg: float
+) -> None:
+    """Refuse a fuel rate, shapes (K,), that is below 0 or gives an efficiency of 1 or more.
+
+    Raises:
+        ConfigError: so; the message names the entry of ``field``, its value and what is allowed.
+    """
+    least = power_w / fuel_lhv_j_per_kg
+    good = np.where(power_w > 0.0, fuel_kg_per_s > least, fuel_kg_per_s >= 0.0)
+    if not np.all(good):
+        k = int(np.argmin(good))
+        allowed = (
+            f"> {least[k]:.6g} at {power_w[k]:g} W: power / engine.fuel_lhv_j_per_kg "
+            f"({fuel_lhv_j_per_kg:g}), an efficiency below 1"
+        )
+        check_entries(field, fuel_kg_per_s, good, allowed if power_w[k] > 0.0 else ">= 0")
 
 
 def efficiency(params: EngineParams, power_w: FloatArray) -> FloatArray:
@@ -128,8 +151,9 @@ def power_range_w(
     """
     ramp_w = params.ramp_w_per_s * dt_s
     present_w = np.where(engine_on, engine_power_w, 0.0)
-    may_run = engine_on | (time_in_state_s >= params.min_off_s)
+    waited_s = time_in_state_s + TIME_ROUNDING_S
+    may_run = engine_on | (waited_s >= params.min_off_s)
     least_w = np.where(may_run, np.maximum(present_w - ramp_w, 0.0), 0.0)
     most_w = np.where(may_run, np.minimum(present_w + ramp_w, params.power_max_w), 0.0)
-    may_be_off = ~engine_on | (time_in_state_s >= params.min_on_s)
+    may_be_off = ~engine_on | (waited_s >= params.min_on_s)
     return least_w, most_w, may_be_off

@@ -57,6 +57,66 @@ def test_values_out_of_range_are_refused(tmp_path, document, section, field, val
     assert field in refused(tmp_path, document)
 
 
+CURVE = "engine.curves.optimal_line"
+NAMED = [
+    ("engine.idle_fuel_kg_per_s", 2.5, "engine.idle_fuel_kg_per_s: 2.5", "< 0.00052878"),
+    ("battery.ocv_v.3", 100.0, "battery.ocv_v.3: 100.0", ">= 640.44"),
+    ("battery.ocv_v.3", -1.0, "battery.ocv_v.3: ", "greater than 0 (got -1.0)"),
+    ("battery.ocv_soc.3", 0.9, "battery.ocv_soc.4: 0.35", "> 0.9"),
+    ("battery.ocv_soc.24", 0.79, "battery.ocv_soc.24: 0.79", "> 0.825"),
+    (f"{CURVE}.power_w.3", 1.0, f"{CURVE}.power_w.3: 1.0", "> 15000.0"),
+    (f"{CURVE}.power_w.54", 275001.0, f"{CURVE}.power_w.54: 275001.0", "275000.0"),
+    (f"{CURVE}.power_w", [1.0, 2.0], f"{CURVE}.power_w: 2 entries", "55"),
+    (f"{CURVE}.fuel_kg_per_s.3", 1e-5, f"{CURVE}.fuel_kg_per_s.3: 1e-05", "> 0.000468384"),
+    ("engine.curve", "nosuch", "engine.curve: 'nosuch'", "fixed_1800_rpm, optimal_line"),
+    ("engine.curves", {}, "engine.curves, engine.curve_power_w: none given", "either"),
+    ("engine", None, "engine: nothing", "a mapping"),
+    ("battery", {}, "battery.energy_j: is missing", "4 more"),
+    ("generator.curve_efficiency.3", 0.0, "generator.curve_efficiency.3: ", "greater than 0"),
+]
+"""What the field tractor's file has changed, and the field, value and range a reader is told."""
+
+
+@pytest.mark.parametrize(("dotted", "value", "start", "allowed"), NAMED)
+def test_a_wrong_curve_is_refused_with_its_entry_its_value_and_the_range(
+    tmp_path, dotted, value, start, allowed
+):
+    document = yaml.safe_load(resource_path("config", "powertrain", "field.yaml").read_text())
+    *parents, last = (int(part) if part.isdigit() else part for part in dotted.split("."))
+    place = document
+    for parent in parents:
+        place = place[parent]
+    place[last] = value
+    message = refused(tmp_path, document)
+    assert f"mine.yaml: {start}" in message and allowed in message
+    assert "{'" not in message and "_Engine" not in message and len(message) < 300
+
+
+@pytest.mark.parametrize(
+    ("field", "k", "value", "allowed"),
+    [
+        ("curve_efficiency", 1, 1.0, "0 < value < 1"),
+        ("curve_power_w", 0, 1.0, "allowed 0"),
+        ("curve_power_w", 2, 0.0, "> "),
+    ],
+)
+def test_a_wrong_efficiency_curve_is_refused_with_its_entry(
+    tmp_path, document, field, k, value, allowed
+):
+    document["engine"][field][k] = value
+    message = refused(tmp_path, document)
+    assert f"engine.{field}.{k}: {value}" in message and allowed in message
+
+
+@pytest.mark.parametrize("text", ["", "---\n", "[]", "5", "diesel"])
+def test_a_file_that_holds_no_settings_is_refused_in_words_of_the_reader(tmp_path, text):
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match="allowed a mapping of names to values") as caught:
+        load_powertrain(path)
+    assert "_Powertrain" not in str(caught.value)
+
+
 def test_text_that_is_not_yaml_is_refused(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("engine: [1,\n  {")
