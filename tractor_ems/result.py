@@ -7,9 +7,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tractor_msgs_py.trajectory import BoolArray, Trajectory
-from tractor_sim.battery import discharge_current_a
+from tractor_msgs_py.trajectory import BoolArray, FloatArray, Trajectory
+from tractor_sim.battery import discharge_current_a, soc_after
 from tractor_sim.duty_cycle.cycle import DutyCycle, Split, cycle_hash
+from tractor_sim.engine import fuel_rate_kg_per_s
 from tractor_sim.figures import run_figures
 from tractor_sim.generator import to_bus_w, to_crank_w
 from tractor_sim.powertrain import PowertrainParams
@@ -26,6 +27,7 @@ POWER_TOLERANCE_W = 1e-3
 SOC_TOLERANCE = 1e-9
 CURRENT_TOLERANCE_A = 1e-3
 TIME_TOLERANCE_S = 1e-6
+FUEL_TOLERANCE_KG = 1e-9
 
 
 @dataclass(frozen=True)
@@ -137,7 +139,8 @@ def summarise(
 
 def count_violations(trajectory: Trajectory, params: PowertrainParams) -> int:
     """Steps that break the SOC window, a limit of the battery's power or current, of the engine's
-    power, ramp or minimum times, or the bus balance.
+    power, ramp or minimum times, or the bus balance; whose SOC or fuel does not follow from
+    their powers; or that hold a negative loss or a number that is not finite.
 
     Judged from the columns, not by the plant's own limit code.
     """
@@ -158,9 +161,25 @@ def count_violations(trajectory: Trajectory, params: PowertrainParams) -> int:
         - (trajectory.shortfall_j - trajectory.dissipated_j) / params.dt_s
     )
     unbalanced = np.abs(residual_w) > POWER_TOLERANCE_W
-    not_finite = ~np.isfinite(battery_w + engine_w + trajectory.fuel_kg)
-    engine_broken = _engine_limits_broken(trajectory, params)
-    return int(np.count_nonzero(outside[1:] | too_much | engine_broken | unbalanced | not_finite))
+    columns = (trajectory.power_demand_w, battery_w, engine_w, trajectory.fuel_kg, soc[1:])
+    not_finite = ~np.isfinite(np.sum(columns, axis=0) + trajectory.shortfall_j)
+    not_finite |= ~np.isfinite(trajectory.soc + trajectory.dissipated_j)
+    moved = soc_after(battery, trajectory.soc, battery_w, params.dt_s)
+    broken = outside[1:] | too_much | unbalanced | not_finite
+    broken |= np.abs(soc[1:] - moved) > SOC_TOLERANCE
+    broken |= (trajectory.shortfall_j < 0.0) | (trajectory.dissipated_j < 0.0)
+    broken |= np.abs(trajectory.fuel_kg - _fuel_kg(trajectory, params)) > FUEL_TOLERANCE_KG
+    return int(np.count_nonzero(broken | _engine_limits_broken(trajectory, params)))
+
+
+def _fuel_kg(trajectory: Trajectory, params: PowertrainParams) -> FloatArray:
+    """Fuel of every step by the engine's curve, and of its start, shape (T,)."""
+    engine, on = params.engine, trajectory.engine_on
+    crank_w = to_crank_w(params.generator, trajectory.engine_power_w, engine.power_max_w)
+    started = on & ~np.append(False, on[:-1])
+    burnt_kg = fuel_rate_kg_per_s(engine, crank_w, on) * params.dt_s
+    fuel_kg: FloatArray = burnt_kg + started * engine.start_fuel_kg
+    return fuel_kg
 
 
 def _engine_limits_broken(trajectory: Trajectory, params: PowertrainParams) -> BoolArray:
@@ -179,5 +198,6 @@ def _engine_limits_broken(trajectory: Trajectory, params: PowertrainParams) -> B
         least_s = engine.min_on_s if on[last] else engine.min_off_s
         broken[last + 1] |= (last - first) * params.dt_s < least_s - TIME_TOLERANCE_S
     if on[0] and len(changes):  # started at once
-        broken[changes[0] + 1] |= (changes[0] + 1) * params.dt_s < engine.min_on_s
+        stood_s = (changes[0] + 1) * params.dt_s
+        broken[changes[0] + 1] |= stood_s < engine.min_on_s - TIME_TOLERANCE_S
     return broken

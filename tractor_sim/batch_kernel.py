@@ -138,7 +138,8 @@ def bounds_of(
     charge_w = _least(charge_w, plant.battery_max_w)
     discharge_w = _least(discharge_w, plant.battery_max_w)
 
-    may_run = engine_on | (time_in_state_s >= plant.min_off_s)
+    waited_s = time_in_state_s + 1e-6  # TIME_ROUNDING_S of the engine
+    may_run = engine_on | (waited_s >= plant.min_off_s)
     present_w = _at(plant.crank_of_bus, knots, segments, engine_power_w)
     present_w = present_w if engine_on else 0.0
     least_w = _most(present_w - plant.ramp_w, 0.0)
@@ -147,7 +148,7 @@ def bounds_of(
     most_w = _at(plant.bus_of_crank, knots, segments, most_w)
     least_w = least_w if may_run else 0.0
     most_w = most_w if may_run else 0.0
-    may_be_off = (not engine_on) | (time_in_state_s >= plant.min_on_s)
+    may_be_off = (not engine_on) | (waited_s >= plant.min_on_s)
     return Bounds(charge_w, discharge_w, most_w, least_w, may_be_off, ocv_v)
 
 

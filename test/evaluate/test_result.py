@@ -84,13 +84,16 @@ def test_a_run_that_dp_cannot_judge_is_reported_with_the_reason(monkeypatch):
 @pytest.mark.parametrize(
     ("column", "value"),
     [
-        ("soc", 0.9001),
-        ("soc", 0.6999),
         ("battery_power_w", 260e3),
         ("engine_power_w", 276e3),
         ("engine_power_w", -1.0),
         ("fuel_kg", np.nan),
+        ("fuel_kg", 0.5),
+        ("fuel_kg", -0.001),
         ("shortfall_j", 500.0),
+        ("shortfall_j", np.nan),
+        ("dissipated_j", -500.0),
+        ("power_demand_w", np.nan),
     ],
 )
 def test_every_kind_of_violation_is_counted(column, value):
@@ -98,6 +101,14 @@ def test_every_kind_of_violation_is_counted(column, value):
     values = getattr(trajectory, column).copy()
     values[100] = value
     assert count_violations(dataclasses.replace(trajectory, **{column: values}), PAPER) == 1
+
+
+@pytest.mark.parametrize("soc", [0.9001, 0.6999, 0.86, np.nan])
+def test_a_soc_that_no_power_explains_breaks_the_steps_on_either_side(soc):
+    trajectory = driven(RuleBased(PAPER))
+    values = trajectory.soc.copy()
+    values[100] = soc
+    assert count_violations(dataclasses.replace(trajectory, soc=values), PAPER) == 2
 
 
 @pytest.mark.parametrize("policy", [RuleBased(PAPER), BestPoint(PAPER), MyopicGreedy(PAPER)])
