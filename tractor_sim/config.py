@@ -5,11 +5,11 @@ file's embedded powertrain passes the same checks.
 """
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from tractor_msgs_py.errors import ConfigError
@@ -25,6 +25,9 @@ from tractor_sim.yaml_file import read_yaml
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
+
+_VALUE = re.compile(r"[+-]?[0-9.][0-9.eE+-]*|[A-Za-z][A-Za-z0-9_.-]*")
+"""What may stand behind ``=`` in a changed setting."""
 
 _SHOWN = 80
 """Characters of a wrong value that an error message repeats."""
@@ -125,24 +128,34 @@ def read_powertrain(name_or_path: str) -> tuple[str, Any]:
     document = read_yaml(path)
     if not settings:
         return str(path), document
+    given: set[str] = set()
     for setting in settings.split(","):
         dotted, equals, value = setting.partition("=")
         *parents, last = dotted.split(".")
         place = document
         for parent in parents:
             place = place.get(parent) if isinstance(place, dict) else None
-        if not (equals and last and isinstance(place, dict)):
+        if not (equals and last and isinstance(place, dict) and dotted not in given):
             raise ConfigError(
-                f"powertrain {name_or_path!r}: {setting!r} is no setting of {path}, "
-                "write for instance engine.start_fuel_kg=0.06"
+                f"powertrain {name_or_path!r}: {setting!r} is no setting of {path} or "
+                "given twice, write for instance engine.start_fuel_kg=0.06"
             )
-        try:
-            place[last] = yaml.safe_load(value)
-        except (yaml.YAMLError, ValueError, RecursionError):  # ValueError: a date 2023-13-01
+        given.add(dotted)
+        if not _VALUE.fullmatch(value):
             raise ConfigError(
-                f"powertrain {_shown(name_or_path)}: {_shown(value)} is no value of {dotted}"
-            ) from None
+                f"powertrain {_shown(name_or_path)}: {_shown(value)} is no value of {dotted}, "
+                "allowed a number, null or a name"
+            )
+        place[last] = None if value == "null" else _number_or_name(value)
     return f"{path}:{settings}", document
+
+
+def _number_or_name(text: str) -> float | str:
+    """No YAML: there yes is a truth value, 1:30 is ninety and 2023-13-01 an error."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def _check_curves(engine: _Engine) -> None:
