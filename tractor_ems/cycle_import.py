@@ -1,10 +1,14 @@
 """Recordings of demand, CSV or bag, to duty cycles in CSV with an account of every repair."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from tractor_msgs_py.errors import BagError, ConfigError
+from tractor_msgs_py.errors import BagError, ConfigError, CycleError
+from tractor_msgs_py.topics import POWER_DEMAND
+from tractor_msgs_py.trajectory import FloatArray
+from tractor_msgs_py.types import PowerDemand
 from tractor_sim.duty_cycle.cycle import DutyCycle
 from tractor_sim.duty_cycle.cycle_csv import read_rows, write_cycle_csv
 from tractor_sim.duty_cycle.resample import Account, ImportSettings, Samples, resample
@@ -25,13 +29,14 @@ def import_cycle(
         The files written and the account.
 
     Raises:
-        CycleError: see ``resample``, or the file is malformed.
+        CycleError: see ``resample``, the file is malformed, or auxiliaries were given for a
+            recording that announces its own.
         BagError: the bag cannot be read, or holds several runs.
         ConfigError: ``out`` is no CSV name, exists, or cannot be written.
     """
     check_out(out, force)
-    samples = _from_csv(source) if source.suffix.lower() == ".csv" else _from_bag(source)
-    pieces, account = resample(samples, settings)
+    read = _from_csv if source.suffix.lower() == ".csv" else _from_bag
+    pieces, account = resample(read(source, settings.aux_w), settings)
     paths = [out]
     if len(pieces) > 1:
         paths = [out.with_name(f"{out.stem}_{n}{out.suffix}") for n in range(1, len(pieces) + 1)]
@@ -54,10 +59,15 @@ def check_out(out: Path, force: bool) -> None:
         raise ConfigError(f"{out}: exists already (--force replaces it)")
 
 
-def _from_csv(path: Path) -> Samples:
+def _from_csv(path: Path, aux_w: float | None) -> Samples:
     lines, rows = read_rows(path)
-    cells = np.array([[_number(cell) for cell in row] for row in rows]).reshape(-1, 2)
-    return Samples(str(path), np.array(lines, dtype=np.int64), cells[:, 0], cells[:, 1])
+    time_s: FloatArray = np.array([_number(row[0]) for row in rows], dtype=np.float64)
+    power_w: FloatArray = np.array([_number(row[1]) for row in rows], dtype=np.float64)
+    place = np.array(lines, dtype=np.int64)
+    samples = Samples(str(path), place, time_s, power_w, cells=rows)
+    if aux_w is None:
+        return replace(samples, auxiliaries="none expected in a CSV, not removed")
+    return _less(samples, aux_w, "--aux-w")
 
 
 def _number(cell: str) -> float:
@@ -67,25 +77,67 @@ def _number(cell: str) -> float:
         return float("nan")
 
 
-def _from_bag(path: Path) -> Samples:
-    """Demand of the bag's only run, less the auxiliaries that its plant added."""
+def _from_bag(path: Path, aux_w: float | None) -> Samples:
+    """Every demand message of the bag's only run, less the auxiliaries that its plant added."""
     from tractor_ems.bags.read import read_bag
+    from tractor_msgs_py.observation import refusal
 
     runs = [run for run in read_bag(path) if run.demand]
     if len(runs) != 1:
         raise BagError(f"{path}: {len(runs)} runs with a power demand, a cycle needs exactly one")
-    run = runs[0]
-    stamp_ns = np.array(list(run.demand), dtype=np.int64)
-    p_aux_w = 0.0 if run.info is None else run.info.p_aux_w
-    demand_w = np.array([sample.power_w for sample in run.demand.values()]) - p_aux_w
-    refused = dict(run.refusals)
-    if run.duplicates:
-        refused["repeated stamp"] = run.duplicates
-    return Samples(
+    info = runs[0].info
+    demand = _demand_messages(path, runs[0].namespace)
+    reasons = [refusal(sample, info) or "" for sample in demand]
+    # What is no number or too large has a place of its own in the account.
+    refused = ["" if r in ("not_finite", "demand_out_of_range") else r for r in reasons]
+    stamp_ns = np.array([sample.stamp_ns for sample in demand], dtype=np.int64)
+    start_ns = next(iter(runs[0].demand))
+    samples = Samples(
         str(path),
-        np.arange(1, len(stamp_ns) + 1),
-        (stamp_ns - stamp_ns[0]) * 1e-9,
-        demand_w,
+        np.arange(1, len(demand) + 1),
+        (stamp_ns - start_ns) * 1e-9,
+        np.array([sample.power_w for sample in demand]),
         place_name="message",
-        refused=tuple(sorted(refused.items())),
+        refused=refused,
     )
+    if info is not None:
+        if aux_w is not None:
+            raise CycleError(
+                f"--aux-w: {aux_w:g} W, but {path} announces auxiliaries of {info.p_aux_w:g} W; "
+                "allowed only for a recording that announces none"
+            )
+        return _less(samples, info.p_aux_w, "announced by the recording")
+    if aux_w is not None:
+        return _less(samples, aux_w, "--aux-w")
+    return replace(samples, auxiliaries="unknown, not removed")
+
+
+def _less(samples: Samples, aux_w: float, known_from: str) -> Samples:
+    """Samples without a constant auxiliary power."""
+    return replace(
+        samples,
+        power_demand_w=samples.power_demand_w - aux_w,
+        auxiliaries=f"{aux_w:g} W removed ({known_from})",
+        auxiliaries_removed_w=aux_w,
+    )
+
+
+def _demand_messages(path: Path, namespace: str) -> list[PowerDemand]:
+    """The demand of one tractor in the order of its reception, refused samples and repeats too.
+
+    The bag has been read once before: it is readable and its topics are the contract's.
+    """
+    from rosbags.rosbag2 import Reader
+
+    from tractor_ems.bags.read import decode, storage_file
+
+    topic = f"{namespace.rstrip('/')}/{POWER_DEMAND.name}"
+    found: list[PowerDemand] = []
+    whole = path if (path / "metadata.yaml").is_file() else storage_file(path)
+    with Reader(whole) as reader:
+        wanted = [c for c in reader.connections if c.topic == topic]
+        for _, _, data in reader.messages(connections=wanted):
+            sample = decode(POWER_DEMAND.name, bytes(data))
+            assert isinstance(sample, PowerDemand)
+            found.append(sample)
+    return found

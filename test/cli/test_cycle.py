@@ -5,11 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from tractor_ems.bags.in_process import record_in_process
+from tractor_ems.bags.in_process import record_in_process, write_samples_bag
 from tractor_ems.cli import main
 from tractor_ems.policies.rules import Conventional
 from tractor_ems.scenario import make_scenario
 from tractor_msgs_py.errors import CycleError
+from tractor_msgs_py.types import PowerDemand
 from tractor_sim.duty_cycle.cycle import cycle_hash
 from tractor_sim.duty_cycle.cycle_csv import read_cycle_csv
 from tractor_sim.duty_cycle.library import load_cycle
@@ -106,6 +107,78 @@ def test_a_bag_imports_to_the_demand_of_its_cycle_without_the_auxiliaries(capsys
     )
 
 
+def demand_bag(path, demand):
+    """A bag of demand alone, from (stamp [s], power [W])."""
+    samples = [PowerDemand(round(stamp_s * 1e9), power_w) for stamp_s, power_w in demand]
+    write_samples_bag(path, samples, {})
+    return path
+
+
+@pytest.mark.parametrize(
+    ("options", "removed_w", "said"),
+    [((), 0.0, "unknown, not removed"), (("--aux-w", "4000"), 4e3, "4000 W removed (--aux-w)")],
+)
+def test_a_bag_of_demand_alone_says_what_became_of_its_auxiliaries(
+    capsys, tmp_path, options, removed_w, said
+):
+    bag = demand_bag(tmp_path / "bag", [(k, 50e3 + k) for k in range(1, 21)])
+    out = tmp_path / "cycle.csv"
+    account = document(capsys, "cycle", "import", bag, "--out", out, *options)
+    assert account["auxiliaries"] == said
+    assert account["auxiliaries_removed_w"] == removed_w
+    expected = [50e3 + k - removed_w for k in range(1, 21)]
+    assert read_cycle_csv(out).power_demand_w.tolist() == expected
+    assert main(["cycle", "import", str(bag), "--out", str(out), "--force", *options]) == 0
+    assert said in capsys.readouterr().out
+
+
+def test_auxiliaries_are_not_taken_off_twice(capsys, tmp_path):
+    source = tmp_path / "mine.csv"
+    source.write_text(HEAD + "0,50000\n1,60000\n2,70000\n")
+    bag, out = tmp_path / "bag", tmp_path / "cycle.csv"
+    record_in_process(Conventional(), make_scenario("field", str(source)), bag)
+    assert "announces auxiliaries of 4000 W" in refusal(
+        capsys, "cycle", "import", bag, "--out", out, "--aux-w", "1"
+    )
+    account = document(capsys, "cycle", "import", bag, "--out", out)
+    assert account["auxiliaries_removed_w"] == make_scenario("field", str(source)).params.p_aux_w
+    account = document(capsys, "cycle", "import", source, "--out", tmp_path / "a.csv")
+    assert account["auxiliaries_removed_w"] == 0
+    document(capsys, "cycle", "import", source, "--out", tmp_path / "b.csv", "--aux-w", "1000")
+    assert read_cycle_csv(tmp_path / "b.csv").power_demand_w.tolist() == [49e3, 59e3, 69e3]
+
+
+def test_every_message_of_a_bag_is_in_the_account_and_the_first_dropped_has_its_number(
+    capsys, tmp_path
+):
+    demand = [(k, 1e3 * k) for k in range(1, 41)]
+    demand[6:6] = [(6.5, np.nan)]  # message 7
+    demand[10:10] = [(demand[9][0], 7e3), (0, 5e3)]  # a repeat and a stamp that is not set
+    demand[20] = (demand[20][0], 3e6)
+    bag, out = demand_bag(tmp_path / "bag", demand), tmp_path / "cycle.csv"
+    account = document(capsys, "cycle", "import", bag, "--out", out, "--max-dropped", "0.2")
+    assert account["rows_read"] == 43 and account["rows_kept"] == 39
+    assert account["first_dropped"] == ("message 7: not a number, time_s 5.5, power_demand_w nan")
+    dropped = {
+        k.removeprefix("dropped_"): v for k, v in account.items() if k.startswith("dropped_")
+    }
+    assert dropped == {
+        "not_a_number": 1,
+        "absurd_power": 1,
+        "duplicate_time": 1,
+        "time_backwards": 0,
+    }
+    assert account["refused"] == {"zero_stamp": 1}
+    assert read_cycle_csv(out).power_demand_w.tolist() == [1e3 * k for k in range(1, 41)]
+
+
+def test_a_bag_of_one_message_is_refused_with_its_place(capsys, tmp_path):
+    bag = demand_bag(tmp_path / "bag", [(1, 5e3)])
+    assert "bag: message 1: 1 usable rows of 1" in refusal(
+        capsys, "cycle", "import", bag, "--out", tmp_path / "x.csv"
+    )
+
+
 @pytest.mark.parametrize(
     ("argv", "named"),
     [
@@ -117,7 +190,20 @@ def test_a_bag_imports_to_the_demand_of_its_cycle_without_the_auxiliaries(capsys
         (["generate", "planter", "--seed", "1", "--out", "x.csv", "--depth-cm", "5"], "planter"),
         (["import", "missing.csv", "--out", "x.csv"], "missing.csv"),
         (["import", "missing_bag", "--out", "x.csv"], "missing_bag"),
-        (["import", "one.csv", "--out", "x.csv"], "one.csv: 1 usable rows"),
+        (["import", "one.csv", "--out", "x.csv"], "one.csv: line 2: 1 usable rows of 1"),
+        (
+            ["import", "hex.csv", "--out", "x.csv"],
+            "line 3: not a number, time_s 1, power_demand_w",
+        ),
+        (["import", "hex.csv", "--out", "x.csv"], "power_demand_w '0x10'"),
+        (
+            ["import", "one.csv", "--out", "x.csv", "--aux-w", "-1"],
+            "aux_w: -1.0, allowed 0..2000000",
+        ),
+        (
+            ["generate", "baler", "--seed", "1", "--out", "x.csv", "--duration-s", "1"],
+            "--duration-s: 1, allowed 2..172800",
+        ),
         (["import", "one.csv", "--out", "x.csv", "--dt", "0"], "dt_s"),
         (["show", "uneven.csv"], "uneven.csv:4: time_s is 3 after 1"),
     ],
@@ -125,6 +211,7 @@ def test_a_bag_imports_to_the_demand_of_its_cycle_without_the_auxiliaries(capsys
 def test_bad_input_is_refused_in_one_line(capsys, tmp_path, monkeypatch, argv, named):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "one.csv").write_text(HEAD + "0,5000\n")
+    (tmp_path / "hex.csv").write_text(HEAD + "0,1\n1,0x10\n2,1\n")
     (tmp_path / "uneven.csv").write_text(HEAD + "0,1\n1,1\n3,1\n4,1\n")
     assert named in refusal(capsys, "cycle", *argv)
     assert not (tmp_path / "x.csv").exists()

@@ -57,7 +57,7 @@ def test_energy_is_kept_up_to_the_last_part_of_a_step(seed, count, dt_s, usual_s
     try:
         (demand_w,), account = run(time_s, power_w, dt_s=dt_s)
     except CycleError as error:
-        assert "less than one step" in str(error)
+        assert "less than the two steps" in str(error)
         return
     assert 0 <= account.tail_dropped_s < dt_s * (1 + 1e-6)
     lost_j = np.abs(power_w).max() * account.tail_dropped_s
@@ -103,6 +103,19 @@ def test_one_wild_stamp_costs_one_row_not_all_that_follow():
     assert len(demand_w) == 50
 
 
+def test_a_row_said_twice_is_counted_but_takes_nothing_away():
+    _, account = run(np.repeat(np.arange(10), 2), np.repeat(np.arange(10.0), 2))
+    assert (account.rows_read, account.rows_kept, account.dropped_duplicate_time) == (20, 10, 10)
+    with pytest.raises(CycleError, match="9 of 20 rows are unusable"):  # 0 W and -0 W are the same
+        run(np.repeat(np.arange(10), 2), np.repeat(np.arange(10.0), 2) * ([1, -1] * 10))
+
+
+def test_a_piece_of_one_step_makes_no_cycle():
+    pieces, account = run([0, 1, 2, 60, 100, 101], [1, 2, 3, 4, 5, 6], split=True)
+    assert [piece.tolist() for piece in pieces] == [[1, 2, 3], [5, 6]]
+    assert account.tail_dropped_s == 1.0
+
+
 def test_mostly_unusable_recordings_are_refused_with_the_first_fault():
     power_w = np.ones(20)
     power_w[5:10] = np.nan
@@ -114,9 +127,9 @@ def test_mostly_unusable_recordings_are_refused_with_the_first_fault():
     ("time_s", "power_w", "named"),
     [
         ([], [], "0 usable rows of 0"),
-        ([3], [5e3], "1 usable rows of 1"),
+        ([3], [5e3], "line 2: 1 usable rows of 1"),
         ([0, np.nan], [1, 2], "line 3: not a number"),
-        ([0, 0.1], [1, 2], "less than one step of 1 s"),
+        ([0, 0.1], [1, 2], "line 3: ends after 0.2 s, less than the two steps of 1 s"),
         ([0, 1e9], [1, 2], "lasts 1e+09 s"),
     ],
 )
@@ -133,6 +146,9 @@ def test_too_little_or_too_much_is_refused_by_name(time_s, power_w, named):
         {"dt_s": float("nan")},
         {"max_gap_s": -1},
         {"max_power_w": 0},
+        {"max_power_w": 3e6},  # would write what no reader takes
+        {"aux_w": -1},
+        {"aux_w": float("nan")},
         {"max_dropped": 2},
     ],
 )

@@ -8,7 +8,7 @@ import typer
 
 from tractor_ems.cli.output import JsonFlag, print_json, print_result, print_table
 from tractor_msgs_py.errors import ConfigError
-from tractor_sim.duty_cycle.cycle import DutyCycle, Split, cycle_hash
+from tractor_sim.duty_cycle.cycle import DEMAND_LIMIT_W, DutyCycle, Split, cycle_hash
 
 app = typer.Typer(help="Duty cycles.", no_args_is_help=True)
 
@@ -84,7 +84,7 @@ def generate(
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same bytes.")],
     out: Annotated[Path, typer.Option(help="CSV file to write.")],
     duration_s: Annotated[
-        int | None, typer.Option(min=1, help="Length [s]; default the operation's.")
+        int | None, typer.Option(help="Length [s], 2..172800; default the operation's.")
     ] = None,
     depth_cm: Annotated[
         float | None, typer.Option(help="Working depth of tillage [cm]; default from the seed.")
@@ -95,10 +95,14 @@ def generate(
     """Write one cycle of an operation, listed or new, as CSV."""
     from tractor_ems.cycle_import import check_out
     from tractor_sim.duty_cycle.cycle_csv import write_cycle_csv
+    from tractor_sim.duty_cycle.generate import DURATION_MAX_S
     from tractor_sim.duty_cycle.library import generate_cycle
     from tractor_sim.duty_cycle.shipped import with_shipped_split
 
     check_out(out, force)
+    # One sample is a cycle, but a file of one row does not say how long its step is.
+    if duration_s is not None and not 2 <= duration_s <= DURATION_MAX_S:
+        raise ConfigError(f"--duration-s: {duration_s}, allowed 2..{DURATION_MAX_S}")
     made = generate_cycle(operation, seed, duration_s=duration_s, depth_cm=depth_cm)
     write_cycle_csv(out, made)
     area_ha = made.area_ha
@@ -124,14 +128,18 @@ def import_(
         float, typer.Option(help="Longest gap that a straight line fills [s].")
     ] = 10.0,
     max_power_w: Annotated[
-        float, typer.Option(help="Larger demand, either way, is dropped [W].")
-    ] = 2e6,
+        float, typer.Option(help="Larger demand, either way, is dropped; at most 2e6 [W].")
+    ] = DEMAND_LIMIT_W,
     max_dropped: Annotated[
         float, typer.Option(help="Share of rows that may be unusable, 0..1.")
     ] = 0.1,
     split_gaps: Annotated[
         bool, typer.Option("--split-gaps", help="Cut at longer gaps, one file per piece.")
     ] = False,
+    aux_w: Annotated[
+        float | None,
+        typer.Option(help="Auxiliaries within the demand, if the recording announces none [W]."),
+    ] = None,
     force: Force = False,
     json: JsonFlag = False,
 ) -> None:
@@ -143,7 +151,7 @@ def import_(
     from tractor_ems.cycle_import import import_cycle
     from tractor_sim.duty_cycle.resample import ImportSettings
 
-    settings = ImportSettings(dt, max_gap_s, max_power_w, max_dropped, split_gaps)
+    settings = ImportSettings(dt, max_gap_s, max_power_w, max_dropped, split_gaps, aux_w)
     paths, account = import_cycle(source, out, settings, force=force)
     document = {"source": str(source), "files": [str(path) for path in paths], "dt_s": dt}
     document |= account.to_json()

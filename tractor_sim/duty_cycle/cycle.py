@@ -14,6 +14,9 @@ Split = Literal["train", "validation", "held_out"]
 POWER_LIMIT_W = 1e9
 """No demand is larger either way: what is, is a wrong unit or a broken sensor."""
 
+DEMAND_LIMIT_W = 2e6
+"""Largest demand, either way, that is read from a file [W]: several times the largest tractor."""
+
 
 @dataclass(frozen=True)
 class DutyCycle:

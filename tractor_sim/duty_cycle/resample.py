@@ -6,6 +6,8 @@ filled is counted.
 """
 
 from bisect import bisect_left
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any
@@ -14,6 +16,8 @@ import numpy as np
 
 from tractor_msgs_py.errors import CycleError
 from tractor_msgs_py.trajectory import BoolArray, FloatArray, IntArray
+from tractor_sim.duty_cycle.cycle import DEMAND_LIMIT_W
+from tractor_sim.duty_cycle.cycle_csv import quoted
 
 GAP = 1.5
 """An interval longer than this many usual ones is a gap: at least one sample is missing."""
@@ -29,23 +33,34 @@ class ImportSettings:
     Attributes:
         dt_s: step of the result, 0 < dt_s <= 60 [s].
         max_gap_s: longest gap that is filled by a straight line [s].
-        max_power_w: larger demand, either way, is absurd and dropped [W].
+        max_power_w: larger demand, either way, is absurd and dropped; at most what a cycle file
+            may hold [W].
         max_dropped: greatest share of rows that may be dropped, 0..1.
         split: cut at longer gaps instead of refusing them.
+        aux_w: auxiliary power that is known to be in the demand; None: what the recording
+            announces, if it does [W].
     """
 
     dt_s: float = 1.0
     max_gap_s: float = 10.0
-    max_power_w: float = 2e6
+    max_power_w: float = DEMAND_LIMIT_W
     max_dropped: float = 0.1
     split: bool = False
+    aux_w: float | None = None
 
     def __post_init__(self) -> None:
         ranges = {
             "dt_s": (0 < self.dt_s <= 60, "0 < dt_s <= 60"),
             "max_gap_s": (0 <= self.max_gap_s <= 3600, "0..3600"),
-            "max_power_w": (0 < self.max_power_w <= 1e9, "above 0, at most 1e9"),
+            "max_power_w": (
+                0 < self.max_power_w <= DEMAND_LIMIT_W,
+                f"above 0, at most {DEMAND_LIMIT_W:.0f}",
+            ),
             "max_dropped": (0 <= self.max_dropped <= 1, "0..1"),
+            "aux_w": (
+                self.aux_w is None or 0 <= self.aux_w <= DEMAND_LIMIT_W,
+                f"0..{DEMAND_LIMIT_W:.0f}",
+            ),
         }
         for name, (fits, allowed) in ranges.items():
             if not fits:  # not so for NaN either
@@ -61,9 +76,13 @@ class Samples:
         place: what a row is called in messages and which it is, shape (N,): a line of a CSV file,
             a message of a bag.
         time_s: NaN where it is no number, shape (N,) [s].
-        power_demand_w: NaN where it is no number, shape (N,) [W].
+        power_demand_w: NaN where it is no number, less what of auxiliaries was removed, shape
+            (N,) [W].
         place_name: "line" or "message".
-        refused: samples that the file's reader refused or dropped, by reason.
+        cells: both columns as the file has them, for messages; empty where it is no text.
+        refused: per row why its reader refuses it, empty where it does not; empty: refuses none.
+        auxiliaries: what is known of the auxiliaries in the demand, and what was done.
+        auxiliaries_removed_w: constant that was subtracted [W].
     """
 
     source: str
@@ -71,7 +90,10 @@ class Samples:
     time_s: FloatArray
     power_demand_w: FloatArray
     place_name: str = "line"
-    refused: tuple[tuple[str, int], ...] = ()
+    cells: Sequence[tuple[str, str]] = ()
+    refused: Sequence[str] = ()
+    auxiliaries: str = ""
+    auxiliaries_removed_w: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -79,21 +101,23 @@ class Account:
     """What an import did with the rows.
 
     Attributes:
-        rows_read: all of them.
+        rows_read: all of them: kept, dropped and refused.
         rows_kept: those the result is made of.
         dropped_not_a_number, dropped_absurd_power, dropped_duplicate_time,
         dropped_time_backwards: rows left out, each under its first fault.
         first_dropped: place and fault of the first of them; empty if none.
-        refused: by the reader of a bag, with its reason.
+        refused: rows that the reader of a bag refuses for anything else, by reason.
         usual_step_s: median interval of the kept rows [s].
         gaps_filled, gap_filled_s, longest_gap_s: gaps up to the limit, the time added in them, and
             the longest gap that was filled [s].
         gaps_cut: longer gaps, at which the recording was cut into pieces.
-        tail_dropped_s: less than a step at the ends of the pieces [s].
+        tail_dropped_s: less than a step at the ends of the pieces, and pieces of less than two
+            steps, which make no cycle [s].
         energy_before_j: of the kept rows, each held for its step [J].
         energy_filled_j: of what was put into gaps [J].
         energy_after_j: of the result; the sum of both less the tails [J].
         duration_s, steps: of the result, all pieces together.
+        auxiliaries, auxiliaries_removed_w: as in ``Samples``.
     """
 
     rows_read: int
@@ -115,6 +139,8 @@ class Account:
     energy_after_j: float
     duration_s: float
     steps: int
+    auxiliaries: str
+    auxiliaries_removed_w: float
 
     def to_json(self) -> dict[str, Any]:
         """Plain data."""
@@ -126,14 +152,14 @@ def resample(samples: Samples, settings: ImportSettings) -> tuple[list[FloatArra
 
     Raises:
         CycleError: fewer than two usable rows, too many unusable ones, a gap longer than allowed,
-            less than one step of time, or more steps than any work has; the message names the
+            less than two steps of time, or more steps than any work has; the message names the
             file, the row and the value.
     """
     fault, kept = _usable(samples, settings)
     time_s = samples.time_s[kept] - samples.time_s[kept[0]]
     power_w = samples.power_demand_w[kept]
     usual_s, gap, too_long = _gaps(samples, settings, kept, time_s)
-    pieces, tails_s = [], 0.0
+    pieces, tails_s, longest_s = [], 0.0, 0.0
     before_j, filled_j, filled_s = 0.0, 0.0, 0.0
     edges = [0, *(np.flatnonzero(too_long) + 1).tolist(), len(time_s)]
     for start, stop in pairwise(edges):
@@ -143,13 +169,16 @@ def resample(samples: Samples, settings: ImportSettings) -> tuple[list[FloatArra
         filled_j += float(np.sum((p * hold_s)[made]))
         filled_s += float(np.sum(hold_s[made]))
         demand_w, tail_s = _means(t - t[0], p, hold_s, settings.dt_s)
-        tails_s += tail_s
-        if len(demand_w):
+        longest_s = max(longest_s, float(hold_s.sum()))
+        if len(demand_w) >= 2:
             pieces.append(demand_w)
+            tails_s += tail_s
+        else:
+            tails_s += tail_s + len(demand_w) * settings.dt_s
     if not pieces:
         raise CycleError(
-            f"{samples.source}: lasts {time_s[-1] + usual_s:.6g} s, less than one step of "
-            f"{settings.dt_s:g} s"
+            f"{samples.source}: {samples.place_name} {samples.place[kept[-1]]}: ends after "
+            f"{longest_s:.6g} s, less than the two steps of {settings.dt_s:g} s that a cycle needs"
         )
     steps = sum(map(len, pieces))
     short = gap & ~too_long
@@ -161,7 +190,7 @@ def resample(samples: Samples, settings: ImportSettings) -> tuple[list[FloatArra
         dropped_duplicate_time=int(np.sum(fault == 3)),
         dropped_time_backwards=int(np.sum(fault == 4)),
         first_dropped=_first_dropped(samples, fault),
-        refused=dict(samples.refused),
+        refused=dict(sorted(Counter(filter(None, samples.refused)).items())),
         usual_step_s=usual_s,
         gaps_filled=int(short.sum()),
         gap_filled_s=filled_s,
@@ -173,6 +202,8 @@ def resample(samples: Samples, settings: ImportSettings) -> tuple[list[FloatArra
         energy_after_j=float(sum(piece.sum() for piece in pieces) * settings.dt_s),
         duration_s=steps * settings.dt_s,
         steps=steps,
+        auxiliaries=samples.auxiliaries,
+        auxiliaries_removed_w=samples.auxiliaries_removed_w,
     )
 
 
@@ -184,15 +215,27 @@ def _usable(samples: Samples, settings: ImportSettings) -> tuple[IntArray, IntAr
     total = len(samples.time_s)
     if len(kept) < 2:
         raise CycleError(
-            f"{samples.source}: {len(kept)} usable rows of {total}, at least 2 are needed to know "
-            f"the step{f' ({first})' if first else ''}"
+            f"{_where(samples, kept)}: {len(kept)} usable rows of {total}, at least 2 are needed "
+            f"to know the step{f' ({first})' if first else ''}"
         )
-    if total - len(kept) > settings.max_dropped * total:
+    # A row said twice, as a plant does that waits for its answer, takes nothing away.
+    again = np.flatnonzero(fault == 3)
+    same = kept[np.searchsorted(samples.time_s[kept], samples.time_s[again])]
+    repeats = int(np.sum(samples.power_demand_w[again] == samples.power_demand_w[same]))
+    lost = total - len(kept) - repeats
+    if lost > settings.max_dropped * total:
         raise CycleError(
-            f"{samples.source}: {total - len(kept)} of {total} rows are unusable, allowed "
+            f"{samples.source}: {lost} of {total} rows are unusable, allowed "
             f"{settings.max_dropped:.0%} (--max-dropped; first: {first})"
         )
     return fault, kept
+
+
+def _where(samples: Samples, kept: IntArray) -> str:
+    """The file, and of a single usable row its place."""
+    if len(kept) != 1:
+        return samples.source
+    return f"{samples.source}: {samples.place_name} {samples.place[kept[0]]}"
 
 
 def _gaps(
@@ -220,17 +263,21 @@ def _gaps(
 
 
 _FAULTS = ("", "not a number", "absurd power", "time given before", "time runs backwards")
+_REFUSED = len(_FAULTS)
+"""Fault of a row that its reader refuses for a reason of its own."""
 
 
 def _faults(samples: Samples, settings: ImportSettings) -> IntArray:
-    """Per row 0 or which of ``_FAULTS`` it has.
+    """Per row 0, which of ``_FAULTS`` it has, or ``_REFUSED``.
 
     Of times that do not all rise, the most rows that do are kept: one wild stamp costs one row,
     not all that follow it.
     """
     time_s, power_w = samples.time_s, samples.power_demand_w
     fault = np.zeros(len(time_s), dtype=np.int64)
-    fault[~(np.isfinite(time_s) & np.isfinite(power_w))] = 1
+    if samples.refused:
+        fault[[bool(reason) for reason in samples.refused]] = _REFUSED
+    fault[(fault == 0) & ~(np.isfinite(time_s) & np.isfinite(power_w))] = 1
     fault[(fault == 0) & (np.abs(power_w) > settings.max_power_w)] = 2
     usable = np.flatnonzero(fault == 0)
     rising = _longest_rising(time_s[usable])
@@ -272,9 +319,16 @@ def _first_dropped(samples: Samples, fault: IntArray) -> str:
     if not len(dropped):
         return ""
     k = dropped[0]
+    why = samples.refused[k] if fault[k] == _REFUSED else _FAULTS[fault[k]]
+    shown = [f"{samples.time_s[k]:.9g}", f"{samples.power_demand_w[k]:.6g}"]
+    if samples.cells and fault[k] == 1:
+        values = (samples.time_s[k], samples.power_demand_w[k])
+        for column, value in enumerate(values):
+            if not np.isfinite(value):
+                shown[column] = quoted(samples.cells[k][column])
     return (
-        f"{samples.place_name} {samples.place[k]}: {_FAULTS[fault[k]]}, "
-        f"time_s {samples.time_s[k]:.9g}, power_demand_w {samples.power_demand_w[k]:.6g}"
+        f"{samples.place_name} {samples.place[k]}: {why}, "
+        f"time_s {shown[0]}, power_demand_w {shown[1]}"
     )
 
 
