@@ -91,11 +91,11 @@ def _from_bag(path: Path, aux_w: float | None) -> Samples:
     # What is no number or too large has a place of its own in the account.
     refused = ["" if r in ("not_finite", "demand_out_of_range") else r for r in reasons]
     stamp_ns = np.array([sample.stamp_ns for sample in demand], dtype=np.int64)
-    start_ns = next(iter(runs[0].demand))
+    time_s: FloatArray = (stamp_ns - next(iter(runs[0].demand))).astype(np.float64) * 1e-9
     samples = Samples(
         str(path),
         np.arange(1, len(demand) + 1),
-        (stamp_ns - start_ns) * 1e-9,
+        time_s,
         np.array([sample.power_w for sample in demand]),
         place_name="message",
         refused=refused,

@@ -205,6 +205,7 @@ def test_a_bag_of_one_message_is_refused_with_its_place(capsys, tmp_path):
             "--duration-s: 1, allowed 2..172800",
         ),
         (["import", "one.csv", "--out", "x.csv", "--dt", "0"], "dt_s"),
+        (["show", "absurd.csv"], "absurd.csv:3: power_demand_w is 1e7, allowed -2000000..2000000"),
         (["show", "uneven.csv"], "uneven.csv:4: time_s is 3 after 1"),
     ],
 )
@@ -212,6 +213,7 @@ def test_bad_input_is_refused_in_one_line(capsys, tmp_path, monkeypatch, argv, n
     monkeypatch.chdir(tmp_path)
     (tmp_path / "one.csv").write_text(HEAD + "0,5000\n")
     (tmp_path / "hex.csv").write_text(HEAD + "0,1\n1,0x10\n2,1\n")
+    (tmp_path / "absurd.csv").write_text(HEAD + "0,1\n1,1e7\n2,1\n")
     (tmp_path / "uneven.csv").write_text(HEAD + "0,1\n1,1\n3,1\n4,1\n")
     assert named in refusal(capsys, "cycle", *argv)
     assert not (tmp_path / "x.csv").exists()
