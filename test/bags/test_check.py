@@ -9,9 +9,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tractor_ems.bags.announced_cycle import compare
 from tractor_ems.bags.check import CHECKS, check, first_difference, shipped_powertrain
-from tractor_ems.bags.in_process import write_demand_bag
+from tractor_ems.bags.in_process import run_info_of, samples_of, write_demand_bag
 from tractor_ems.bags.inspect import info
+from tractor_ems.drive import drive
+from tractor_ems.policies.rules import RuleBased
+from tractor_ems.scenario import Scenario
 from tractor_msgs_py.errors import BagError
 from tractor_msgs_py.types import (
     BatteryPowerCommand,
@@ -20,6 +24,10 @@ from tractor_msgs_py.types import (
     PowertrainReading,
     RunInfo,
 )
+from tractor_sim.config import load_powertrain
+from tractor_sim.duty_cycle.cycle import cycle_hash
+from tractor_sim.duty_cycle.generate import generate
+from tractor_sim.duty_cycle.library import load_cycle
 
 
 def changed(samples, kind, k, **values):
@@ -196,3 +204,64 @@ def test_a_complete_run_of_no_possible_cycle_gets_a_verdict(driven, write):
 def test_a_demand_of_no_tractor_fails_the_values(driven, write):
     report = check(write(changed(driven.samples, PowerDemand, 5, power_w=2e9)))
     assert report.outcome("values") == "fail"
+
+
+def on_field(cycle, setting=""):
+    """Samples of a cycle driven on the field tractor, whose plant adds 4 kW of auxiliaries."""
+    params = load_powertrain(f"field{setting}")
+    soc = params.soc_initial
+    scenario = Scenario(params, cycle, soc, soc, params.name, cycle.name)
+    demand_w = scenario.power_demand_w[None, :]
+    driven = drive(RuleBased(params), params, demand_w, soc, soc)[0]
+    return samples_of(params, run_info_of(scenario, driven, "rule_based"), driven)[0]
+
+
+def of_cycle(report):
+    return next((item.outcome, item.detail) for item in report.checks if item.name == "cycle")
+
+
+@pytest.fixture(scope="module")
+def whole_watts():
+    return generate("chisel_plow", 3, duration_s=60)
+
+
+def test_auxiliaries_come_off_before_the_cycle_is_compared(whole_watts, write):
+    report = check(write(on_field(whole_watts)))
+    assert report.verdict == "pass"
+    assert of_cycle(report) == ("pass", "1 runs, less auxiliaries of 4000 W")
+
+
+@pytest.mark.parametrize("added_w", [1.0, 1e-6])
+def test_one_altered_demand_is_not_the_cycle_with_auxiliaries_either(whole_watts, write, added_w):
+    samples = on_field(whole_watts)
+    demand_w = float(whole_watts.power_demand_w[30]) + 4000.0
+    altered = changed(samples, PowerDemand, 30, power_w=demand_w + added_w)
+    assert of_cycle(check(write(altered)))[0] == "fail"
+
+
+def test_auxiliaries_of_a_broken_watt_come_off_a_cycle_of_whole_watts(whole_watts, write):
+    samples = on_field(whole_watts, ":p_aux_w=4000.1")
+    assert np.any(whole_watts.power_demand_w + 4000.1 - 4000.1 != whole_watts.power_demand_w)
+    assert of_cycle(check(write(samples)))[0] == "pass"
+
+
+def test_a_listed_cycle_of_broken_watts_is_compared_as_the_plant_added_it_up(driven):
+    cycle = load_cycle("planter")
+    demand_w = cycle.power_demand_w + 4000.0
+    assert np.any(demand_w - 4000.0 != cycle.power_demand_w)
+    said = dataclasses.replace(
+        driven.info, cycle="planter", cycle_hash=cycle_hash(cycle), p_aux_w=4000.0
+    )
+    assert compare(demand_w, said) == "same"
+    demand_w[30] = np.nextafter(demand_w[30], np.inf)
+    assert compare(demand_w, said) == "other"
+
+
+def test_what_rounding_hides_of_an_unlisted_cycle_is_said_not_guessed(write):
+    whole = load_cycle("planter")
+    rounded = whole.power_demand_w + 4000.0 - 4000.0 != whole.power_demand_w
+    first = int(np.argmax(rounded))
+    part_w = whole.power_demand_w[first : first + 20]
+    part = dataclasses.replace(whole, name="part", power_demand_w=part_w)
+    outcome, why = of_cycle(check(write(on_field(part))))
+    assert outcome == "not_applicable" and "rounding" in why
