@@ -280,6 +280,19 @@ def test_the_command_prints_one_document_and_writes_a_vehicle(steady_bag, tmp_pa
     assert load_powertrain(out).name == "fitted_field"
 
 
+def test_a_vehicle_that_is_there_already_is_replaced_only_with_force(steady_bag, tmp_path, capsys):
+    out = tmp_path / "mine.yaml"
+    out.write_text("name: mine\n")
+    words = ["vehicle", "fit", str(steady_bag), "--powertrain", "field", "--out", str(out)]
+    assert main(words) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.count("\n") == 1
+    assert str(out) in captured.err and "--force" in captured.err
+    assert out.read_text() == "name: mine\n"
+    assert main([*words, "--force"]) == 0
+    assert load_powertrain(out).name == "fitted_field"
+
+
 def test_the_table_names_what_is_not_identified(steady_bag, capsys):
     assert main(["vehicle", "fit", str(steady_bag)]) == 0
     text = capsys.readouterr().out

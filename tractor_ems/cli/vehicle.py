@@ -58,13 +58,16 @@ def fit(
         typer.Option(help="Name or YAML file of what the recording cannot say."),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Powertrain YAML to write.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that exists.")] = False,
     json: JsonFlag = False,
 ) -> None:
     """Fuel curve, start fuel, resistance and capacity from a recording, with errors, and what
     it cannot say."""
     from tractor_ems.vehicle.fit import fit as run
-    from tractor_ems.vehicle.fit_yaml import missing_parts, write_fit
+    from tractor_ems.vehicle.fit_yaml import check_out, missing_parts, write_fit
 
+    if out is not None:
+        check_out(out, force)
     found = run(bag, powertrain)
     origins = None if out is None else write_fit(found, out)
     document = found.to_json()

@@ -25,6 +25,18 @@ from tractor_sim.powertrain_json import params_to_json
 Origins = dict[str, str]
 
 
+def check_out(out: Path, force: bool) -> None:
+    """Refuse a file that exists, before minutes go into the fit that would replace it.
+
+    Raises:
+        ConfigError: ``out`` is a folder, or exists and ``force`` is not set.
+    """
+    if out.is_dir():
+        raise ConfigError(f"{out}: is a folder, give the powertrain file to write")
+    if out.exists() and not force:
+        raise ConfigError(f"{out}: exists already (--force replaces it)")
+
+
 def write_fit(found: VehicleFit, out: Path) -> Origins:
     """Write the powertrain file; returns where each part of it comes from.
 
