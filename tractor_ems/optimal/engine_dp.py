@@ -52,6 +52,12 @@ too little cost more than a start, so the end is met wherever it can be."""
 SHORTFALL_MULTIPLE = 10.0
 """Price of unmet demand in units of that price."""
 
+EVERY_NODE = 8_000_000
+"""Up to so many landings in a pass (steps times nodes times the nodes that one step reaches) all
+are tried; beyond, every node that is :data:`STRIDE_J` from the next, then all around the best."""
+
+STRIDE_J = 20e3
+
 MAX_VALUES = 24_000_000
 """Entries of the two value tables together, 190 MB. A longer cycle gets wider cells."""
 
@@ -219,7 +225,11 @@ def _pass(
     on, off = np.empty((steps + 1, nodes)), np.empty((steps + 1, nodes))
     last = np.clip(rows.base[-1] + rows.cell * np.arange(nodes), low[-1], high[-1])
     on[-1] = off[-1] = end_price_kg * (soc_initial - last)
-    stride = max(1, round(20e3 / cell_j))
+    stride = max(1, round(STRIDE_J / (rows.cell * params.battery.energy_j)))
+    reach_w = min(model.numbers.engine_max_w, 2.0 * params.battery.power_max_w)
+    reached = reach_w * params.dt_s / (rows.cell * params.battery.energy_j)
+    if float(rows.nodes.sum()) * reached <= EVERY_NODE:
+        stride = 1
     backward(on, off, rows, demand_w, model, stride)
     value_kg = value_at(off[0], row_of(rows, 0), soc_initial, model.numbers.missing_kg)
     soc, engine_on = np.empty(steps + 1), np.empty(steps, dtype=np.bool_)

@@ -179,7 +179,7 @@ def choices(
     fuel without a start; standing still is inf where the battery cannot carry the demand. For
     running are tried both ends (engine at its maximum or idling, battery limits), every power that
     lands on a node, where the value needs no interpolation (every ``stride``-th, then all around
-    the best of these), and the fuel curve's kinks within a node of the best.
+    the best so far, an end or one of these), and the fuel curve's kinks within a node of the best.
     """
     ocv_v = open_circuit_v(ocv, soc)
     charge, discharge = limits_w(numbers, soc, ocv_v)
@@ -206,9 +206,12 @@ def choices(
     best += value_at(on, row, lowest, numbers.missing_kg)
     cost = fuel_at(fuel_kg, numbers.engine_max_w, demand_w - low_w)
     cost += value_at(on, row, highest, numbers.missing_kg)
-    if cost < best:
-        best, best_w = cost, low_w
     base, low, high, last, cell = row
+    begin = max(1, int(np.ceil((lowest - base) / cell)))
+    end = min(last - 1, int(np.floor((highest - base) / cell)))
+    found = begin
+    if cost < best:
+        best, best_w, found = cost, low_w, end
     ohm = numbers.resistance_ohm
     for side in range(2):
         after, value = (low, on[0]) if side == 0 else (high, on[last])
@@ -217,12 +220,10 @@ def choices(
             power = (ocv_v - ohm * amps) * amps
             cost = fuel_at(fuel_kg, numbers.engine_max_w, demand_w - power) + value
             if cost < best:
-                best, best_w = cost, power
-    begin = max(1, int(np.ceil((lowest - base) / cell)))
-    end = min(last - 1, int(np.floor((highest - base) / cell)))
+                best, best_w, found = cost, power, begin if side == 0 else end
     per_w, top = (len(fuel_kg) - 1) / numbers.engine_max_w, len(fuel_kg) - 2
     offset_a, per_node_a = (soc - base) * numbers.amps_per_soc, cell * numbers.amps_per_soc
-    found, step = -1, stride
+    step = stride
     while begin <= end:
         for j in range(begin, end + 1, step):
             amps = offset_a - j * per_node_a
@@ -232,7 +233,7 @@ def choices(
             cost = fuel_kg[m] + (x - m) * (fuel_kg[m + 1] - fuel_kg[m]) + on[j]
             if cost < best:
                 best, best_w, found = cost, power, j
-        if step == 1 or found < 0:
+        if step == 1:
             break
         begin, end, step = max(begin, found - stride + 1), min(end, found + stride - 1), 1
     reach_w, centre_w = ocv_v * per_node_a, best_w
