@@ -14,7 +14,7 @@ from tractor_ems.optimal.kernel import backward
 from tractor_msgs_py.errors import ConfigError, CycleError
 from tractor_msgs_py.trajectory import FloatArray
 from tractor_sim import battery as _battery
-from tractor_sim.engine import fuel_rate_kg_per_s
+from tractor_sim.engine import EngineParams, fuel_rate_kg_per_s
 from tractor_sim.generator import to_bus_w, to_crank_w
 from tractor_sim.powertrain import PowertrainParams, battery_power_grid_w
 from tractor_sim.powertrain_json import powertrain_hash
@@ -178,7 +178,32 @@ def engine_knots_w(params: PowertrainParams) -> FloatArray:
     crank_w = np.array(params.engine.curve_power_w)
     if not params.generator.ideal:
         crank_w = np.union1d(crank_w, np.array(params.generator.load_fraction) * peak_w)
+    crank_w = np.union1d(crank_w, _idle_knots_w(params.engine))
     return to_bus_w(params.generator, crank_w, peak_w)
+
+
+def _idle_knots_w(engine: EngineParams) -> FloatArray:
+    """Crankshaft powers where the curve leaves the idle rate, which it never goes below [W].
+
+    Efficiency is a + b P between two knots, so that P / (eta(P) LHV) = idle is linear in P.
+    """
+    idle_kg_per_s, power_w = engine.idle_fuel_kg_per_s, np.array(engine.curve_power_w)
+    if idle_kg_per_s == 0.0:
+        return np.empty(0)
+    if engine.curve_fuel_kg_per_s:
+        fuel = np.array(engine.curve_fuel_kg_per_s)
+        inside = fuel[0] < idle_kg_per_s < fuel[-1]
+        return np.interp([idle_kg_per_s], fuel, power_w) if inside else np.empty(0)
+    efficiency, idle_w = (
+        np.array(engine.curve_efficiency),
+        idle_kg_per_s * engine.fuel_lhv_j_per_kg,
+    )
+    b = np.diff(efficiency) / np.diff(power_w)
+    a = efficiency[:-1] - b * power_w[:-1]
+    slope = 1.0 - idle_w * b
+    crossing_w = idle_w * a / np.where(slope == 0.0, np.nan, slope)
+    found: FloatArray = crossing_w[(power_w[:-1] < crossing_w) & (crossing_w < power_w[1:])]
+    return found
 
 
 def terminal_price_kg_per_j(params: PowertrainParams) -> float:
