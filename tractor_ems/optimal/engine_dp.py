@@ -238,7 +238,7 @@ def _pass(
     end_kg = forward(on, off, rows, demand_w, model, soc, battery_w, engine_on)
     reach = params.battery.power_max_w * params.dt_s / params.battery.energy_j
     co_states(on, off, rows, model, soc, engine_on, reach, co_state)
-    plan = driven(relaxed(params), demand_w, soc, demand_w - battery_w, engine_on)
+    plan = driven(params, demand_w, soc, demand_w - battery_w, engine_on)
     return soc, plan, (value_kg, float(plan.fuel_kg.sum()) + end_kg), co_state
 
 
@@ -249,18 +249,29 @@ def driven(
     engine_power_w: FloatArray,
     engine_on: BoolArray,
 ) -> EnginePlan:
-    """What ``powertrain.step`` makes of every step of a run whose SOC is known, all at once.
+    """What ``powertrain.step`` makes of every step of a run whose SOC is known, all at once, on
+    the relaxed plant: the state before a step is SOC and engine on, no more.
 
-    ``params`` must be a relaxed plant: the state before a step is SOC and engine on, no more.
+    Where the plan has the engine idling though nothing can take its power, it is held on if
+    ``params`` has a least time on, and stops if not; what it does then is where the next step
+    begins.
     """
-    before = np.append(False, engine_on[:-1])
-    state = PlantState(
-        soc=soc[:-1],
-        engine_on=before,
-        time_in_state_s=np.zeros(len(demand_w)),
-        engine_power_w=np.zeros(len(demand_w)),
-    )
-    after, result = step(params, state, demand_w, command(demand_w, engine_power_w, engine_on))
+    free, held = relaxed(params), params.engine.min_on_s > 0.0
+    if held:
+        free = dataclasses.replace(free, engine=dataclasses.replace(free.engine, min_on_s=1.0))
+    wanted, applied = command(demand_w, engine_power_w, engine_on), engine_on
+    while True:
+        before = np.append(False, applied[:-1])
+        state = PlantState(
+            soc=soc[:-1],
+            engine_on=before,
+            time_in_state_s=np.where(before & engine_on, 0.0, 1.0),
+            engine_power_w=np.zeros(len(demand_w)),
+        )
+        after, result = step(free, state, demand_w, wanted)
+        if np.array_equal(after.engine_on, applied):
+            break
+        applied = after.engine_on
     return EnginePlan(
         soc=np.append(soc[:1], after.soc),
         battery_power_w=result.battery_power_w,
@@ -343,6 +354,7 @@ def model_of(params: PowertrainParams) -> Model:
         start_kg=engine.start_fuel_kg,
         missing_kg=missing_kg_per_j * battery.energy_j,
         shortfall_kg_per_w=SHORTFALL_MULTIPLE * missing_kg_per_j * dt_s,
+        held_on=engine.min_on_s > 0.0,
     )
     return Model(numbers, np.array([ocv_soc, ocv_v]), fuel_kg, knots_w[1:-1][kinked])
 

@@ -26,6 +26,9 @@ class Numbers(NamedTuple):
         start_kg: fuel of one start.
         missing_kg: price of ending one SOC too low, or of being where the end is out of reach.
         shortfall_kg_per_w: price of unmet demand over one step.
+        held_on: whether the plant has a least time on, which can keep an engine idling where
+            nothing can take its power. How long it still does is not in the state, so that here
+            it may for any time: a lower bound still. Without, the plant stops it there.
     """
 
     resistance_ohm: float
@@ -39,6 +42,7 @@ class Numbers(NamedTuple):
     start_kg: float
     missing_kg: float
     shortfall_kg_per_w: float
+    held_on: bool
 
 
 class Model(NamedTuple):
@@ -176,7 +180,8 @@ def choices(
     """Least cost to go of running and of standing still in one step, each with its battery power.
 
     ``on`` and ``off`` are the values of the next step, on the nodes of ``row``. Running costs its
-    fuel without a start; standing still is inf where the battery cannot carry the demand. For
+    fuel without a start, and is inf where the plant stops the engine because nothing can take its
+    power; standing still is inf where the battery cannot carry the demand. For
     running are tried both ends (engine at its maximum or idling, battery limits), every power that
     lands on a node, where the value needs no interpolation (every ``stride``-th, then all around
     the best so far, an end or one of these), and the fuel curve's kinks within a node of the best.
@@ -185,6 +190,7 @@ def choices(
     charge, discharge = limits_w(numbers, soc, ocv_v)
     low_w = max(-charge, demand_w - numbers.engine_max_w)
     high_w = min(discharge, demand_w)
+    stopped = demand_w + charge <= ROUNDING_W and not numbers.held_on
     if low_w > high_w:  # no choice: braking into the battery, or everything for the load
         braking = demand_w + charge < 0.0
         power = -charge if braking else discharge
@@ -192,7 +198,7 @@ def choices(
         cost = value_at(on, row, after, numbers.missing_kg)
         if braking:
             still = value_at(off, row, after, numbers.missing_kg)
-            return cost + fuel_kg[0], power, still, power
+            return np.inf if stopped else cost + fuel_kg[0], power, still, power
         short_w = demand_w - numbers.engine_max_w - discharge
         cost += fuel_kg[-1] + numbers.shortfall_kg_per_w * short_w
         return cost, power, np.inf, power
@@ -201,6 +207,8 @@ def choices(
     still = np.inf
     if demand_w <= discharge + ROUNDING_W:
         still = value_at(off, row, lowest, numbers.missing_kg)
+    if stopped:
+        return np.inf, high_w, still, high_w
     best_w = high_w
     best = fuel_at(fuel_kg, numbers.engine_max_w, demand_w - high_w)
     best += value_at(on, row, lowest, numbers.missing_kg)
