@@ -22,13 +22,13 @@ from tractor_ems.optimal.engine_kernel import (
     row_of,
     value_at,
 )
+from tractor_ems.optimal.engine_plan import EnginePlan, driven
 from tractor_ems.optimal.engine_reach import of_use, reachable
-from tractor_ems.policies.planned import command
 from tractor_msgs_py.errors import ConfigError, CycleError
-from tractor_msgs_py.trajectory import BoolArray, FloatArray
+from tractor_msgs_py.trajectory import FloatArray
 from tractor_sim.engine import fuel_rate_kg_per_s
 from tractor_sim.generator import to_crank_w
-from tractor_sim.powertrain import PlantState, PowertrainParams, step
+from tractor_sim.powertrain import PowertrainParams
 from tractor_sim.powertrain_json import powertrain_hash
 
 CELL_J, FULL_STEPS, LEAST_CELL_J = 80e3, 1800, 5e3
@@ -40,7 +40,7 @@ REFINEMENT = 4
 
 BAND_CELLS = 120
 """Half width of that band in cells of the first pass; doubled for as long as the optimum of the
-second pass touches its edge."""
+second pass touches its edge. Narrower from the start where the tables could not hold it."""
 
 FUEL_POINTS = 4097
 """Entries of the fuel table: 62 W apart on "field"."""
@@ -63,37 +63,6 @@ MAX_VALUES = 24_000_000
 
 
 @dataclass(frozen=True)
-class EnginePlan:
-    """One run of a plant, step by step.
-
-    Attributes:
-        soc: (T + 1,), before every step and after the last.
-        battery_power_w: (T,), terminal power, > 0 discharges [W].
-        engine_power_w: (T,), at the bus [W].
-        engine_on: (T,).
-        fuel_kg: (T,), starts included.
-        shortfall_j: (T,).
-    """
-
-    soc: FloatArray
-    battery_power_w: FloatArray
-    engine_power_w: FloatArray
-    engine_on: BoolArray
-    fuel_kg: FloatArray
-    shortfall_j: FloatArray
-
-    @property
-    def starts(self) -> int:
-        """Times that the engine is started; it is off before the first step."""
-        return int(np.sum(self.engine_on & ~np.append(False, self.engine_on[:-1])))
-
-    @property
-    def stops(self) -> int:
-        """Times that the engine is stopped."""
-        return int(np.sum(self.engine_on[:-1] & ~self.engine_on[1:]))
-
-
-@dataclass(frozen=True)
 class EngineSolution:
     """The optimum of the relaxed model.
 
@@ -106,7 +75,7 @@ class EngineSolution:
         power_demand_w: (T,), the cycle it holds for, auxiliaries included [W].
         soc_target: where it had to end, or None.
         end_price_kg_per_j: what a joule at the end was worth, or None.
-        cell_j: distance of the finer nodes [J]; band: (2, T + 1), where they were laid.
+        cell_j: real distance of the finer nodes [J]; band: (2, T + 1), where they were laid.
         powertrain_hash: the powertrain it holds for.
     """
 
@@ -154,6 +123,7 @@ def solve_engine(
     *,
     end_price_kg_per_j: float | None = None,
     cell_j: float | None = None,
+    max_values: int = MAX_VALUES,
 ) -> EngineSolution:
     """Solve one cycle from ``soc_initial`` with the engine off.
 
@@ -164,6 +134,7 @@ def solve_engine(
         end_price_kg_per_j: only with a free end: what a joule left at the end is worth, >= 0.
         cell_j: distance of the nodes of the first pass, > 0, by default :func:`usual_cell_j`; a
             second one is :data:`REFINEMENT` times finer.
+        max_values: entries of the value tables together; more makes the cells wider.
 
     Raises:
         ConfigError: a SOC, price or cell is out of range.
@@ -175,16 +146,16 @@ def solve_engine(
     model = model_of(params)
     low, high = soc_of_use(model, demand_w, soc_initial, soc_target, end_price_kg_per_j)
     price_kg = (end_price_kg_per_j or 0.0) * params.battery.energy_j
-    soc, _, _, _ = _pass(params, model, demand_w, low, high, soc_initial, price_kg, cell_j)
-    half = BAND_CELLS * cell_j / params.battery.energy_j
+    cell = _affordable(low, high, cell_j / params.battery.energy_j, max_values)
+    soc, _, _, _ = _pass(params, model, demand_w, low, high, soc_initial, price_kg, cell)
+    fine = cell_j / REFINEMENT / params.battery.energy_j
+    half = min(BAND_CELLS * REFINEMENT, 0.2 * max_values / len(low)) * fine
     while True:
         # The band leaves the ends of the tube what they are: there it is exact.
         band_low = np.maximum(low, np.minimum(soc - half, high))
         band_high = np.minimum(high, np.maximum(soc + half, low))
-        found = _pass(
-            params, model, demand_w, band_low, band_high, soc_initial, price_kg,
-            cell_j / REFINEMENT,
-        )  # fmt: skip
+        cell = _affordable(band_low, band_high, fine, max_values)
+        found = _pass(params, model, demand_w, band_low, band_high, soc_initial, price_kg, cell)
         soc, plan, values, co_state = found
         margin = half / 20.0
         touched = ((band_low > low) & (soc < band_low + margin)) | (
@@ -202,7 +173,7 @@ def solve_engine(
         power_demand_w=demand_w,
         soc_target=soc_target,
         end_price_kg_per_j=end_price_kg_per_j,
-        cell_j=cell_j / REFINEMENT,
+        cell_j=cell * params.battery.energy_j,
         band=np.stack([band_low, band_high]),
         powertrain_hash=powertrain_hash(params),
     )
@@ -216,19 +187,19 @@ def _pass(
     high: FloatArray,
     soc_initial: float,
     end_price_kg: float,
-    cell_j: float,
+    cell: float,
 ) -> tuple[FloatArray, EnginePlan, tuple[float, float], FloatArray]:
     """SOC of the optimum on one grid, its run, (value, cost) and the co-state per SOC."""
     steps = len(demand_w)
-    rows = rows_of(model, demand_w, low, high, _affordable(low, high, cell_j, params))
+    rows = rows_of(model, demand_w, low, high, cell)
     nodes = int(rows.nodes.max())
     on, off = np.empty((steps + 1, nodes)), np.empty((steps + 1, nodes))
     last = np.clip(rows.base[-1] + rows.cell * np.arange(nodes), low[-1], high[-1])
     on[-1] = off[-1] = end_price_kg * (soc_initial - last)
-    stride = max(1, round(STRIDE_J / (rows.cell * params.battery.energy_j)))
+    cell_j = cell * params.battery.energy_j
+    stride = max(1, round(STRIDE_J / cell_j))
     reach_w = min(model.numbers.engine_max_w, 2.0 * params.battery.power_max_w)
-    reached = reach_w * params.dt_s / (rows.cell * params.battery.energy_j)
-    if float(rows.nodes.sum()) * reached <= EVERY_NODE:
+    if float(rows.nodes.sum()) * reach_w * params.dt_s / cell_j <= EVERY_NODE:
         stride = 1
     backward(on, off, rows, demand_w, model, stride)
     value_kg = value_at(off[0], row_of(rows, 0), soc_initial, model.numbers.missing_kg)
@@ -238,48 +209,9 @@ def _pass(
     end_kg = forward(on, off, rows, demand_w, model, soc, battery_w, engine_on)
     reach = params.battery.power_max_w * params.dt_s / params.battery.energy_j
     co_states(on, off, rows, model, soc, engine_on, reach, co_state)
-    plan = driven(params, demand_w, soc, demand_w - battery_w, engine_on)
+    held = params.engine.min_on_s > 0.0
+    plan = driven(relaxed(params), held, demand_w, soc, demand_w - battery_w, engine_on)
     return soc, plan, (value_kg, float(plan.fuel_kg.sum()) + end_kg), co_state
-
-
-def driven(
-    params: PowertrainParams,
-    demand_w: FloatArray,
-    soc: FloatArray,
-    engine_power_w: FloatArray,
-    engine_on: BoolArray,
-) -> EnginePlan:
-    """What ``powertrain.step`` makes of every step of a run whose SOC is known, all at once, on
-    the relaxed plant: the state before a step is SOC and engine on, no more.
-
-    Where the plan has the engine idling though nothing can take its power, it is held on if
-    ``params`` has a least time on, and stops if not; what it does then is where the next step
-    begins.
-    """
-    free, held = relaxed(params), params.engine.min_on_s > 0.0
-    if held:
-        free = dataclasses.replace(free, engine=dataclasses.replace(free.engine, min_on_s=1.0))
-    wanted, applied = command(demand_w, engine_power_w, engine_on), engine_on
-    while True:
-        before = np.append(False, applied[:-1])
-        state = PlantState(
-            soc=soc[:-1],
-            engine_on=before,
-            time_in_state_s=np.where(before & engine_on, 0.0, 1.0),
-            engine_power_w=np.zeros(len(demand_w)),
-        )
-        after, result = step(free, state, demand_w, wanted)
-        if np.array_equal(after.engine_on, applied):
-            break
-        applied = after.engine_on
-    return EnginePlan(
-        soc=np.append(soc[:1], after.soc),
-        battery_power_w=result.battery_power_w,
-        engine_power_w=result.engine_power_w,
-        engine_on=after.engine_on,
-        fuel_kg=result.fuel_kg,
-        shortfall_j=result.shortfall_j,
-    )
 
 
 def soc_of_use(
@@ -366,13 +298,10 @@ def _fuel_on_kg(params: PowertrainParams, bus_w: FloatArray) -> FloatArray:
     return rate * params.dt_s
 
 
-def _affordable(
-    low: FloatArray, high: FloatArray, cell_j: float, params: PowertrainParams
-) -> float:
-    """The cell as SOC, widened where the tables would pass :data:`MAX_VALUES`."""
-    nodes = MAX_VALUES / (2.0 * len(low))
-    widest = float(np.max(high - low))
-    return max(cell_j / params.battery.energy_j, widest / max(nodes - 3.0, 1.0))
+def _affordable(low: FloatArray, high: FloatArray, cell: float, max_values: int) -> float:
+    """The cell [SOC], widened where the tables would pass ``max_values``."""
+    nodes = max_values / (2.0 * len(low))
+    return max(cell, float(np.max(high - low)) / max(nodes - 3.0, 1.0))
 
 
 def _check(
