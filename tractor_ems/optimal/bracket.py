@@ -13,11 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from tractor_ems.drive import drive
-from tractor_ems.optimal.engine_dp import EnginePlan, EngineSolution, model_of, solve_engine
+from tractor_ems.optimal.engine_dp import PRICE_MULTIPLE, EngineSolution, model_of, solve_engine
 from tractor_ems.optimal.engine_kernel import Model
+from tractor_ems.optimal.engine_plan import EnginePlan
 from tractor_ems.optimal.engine_reach import follow
 from tractor_ems.optimal.ramp_kernel import levels_while, priced_levels
 from tractor_ems.policies.planned import PlannedPolicy
+from tractor_msgs_py.errors import ConfigError
 from tractor_msgs_py.trajectory import BoolArray, FloatArray, Trajectory
 from tractor_sim.battery import discharge_current_a, power_limits_w
 from tractor_sim.engine import fuel_rate_kg_per_s
@@ -26,6 +28,9 @@ from tractor_sim.powertrain import PowertrainParams
 
 LEVELS = 110
 """About how many engine powers are told apart: 2.5 kW on "field"."""
+
+MOST_LEVELS = 4000
+"""A ramp limit so slow that it takes more is refused: the tables hold as many at every step."""
 
 TRIES = ((10.0, 0.0), (0.0, 0.0), (3.0, 0.0), (10.0, 0.004), (0.0, 0.004), (10.0, 0.015))
 """How far a start or stop may be moved [s], and how far the optimum that is followed keeps off the
@@ -46,8 +51,15 @@ PRICE_SPREAD = 1.5
 """The price stays within this factor of its median. At the ends of a cycle, where hardly any
 choice is left, the co-state says what the last joule costs, not what energy is worth."""
 
+LEAST_PRICE = 0.1
+"""A median of the co-state below that share of the largest marginal fuel means that the optimum
+had no choice, and says nothing about what energy is worth: then it is that marginal fuel."""
+
 GROWTH, PRICE_STEP, SEARCH_STEPS = 1.02, 1e-4, 50
 """Of the search for the factor on the price at which the plan ends where it should."""
+
+WIDENINGS = 8
+"""Of that search, each by the square of the one before: to a factor of 160 at most."""
 
 STRETCH_S = 1800.0
 """Least length of the parts of a long cycle that are planned one after the other [s]."""
@@ -111,7 +123,9 @@ def _plan(
     relaxed, demand_w, engine = solution.plan, solution.power_demand_w, params.engine
     levels, model = _levels(params), model_of(params)
     price_kg = solution.co_state_kg_per_j * params.battery.energy_j
-    middle = float(np.median(price_kg))
+    middle, largest = float(np.median(price_kg)), largest_marginal_kg(model)
+    if middle < LEAST_PRICE * largest:
+        middle = largest
     price_kg = np.clip(price_kg, middle / PRICE_SPREAD, middle * PRICE_SPREAD)
     chosen = np.empty(len(demand_w), dtype=np.int64)
     on_kg, off_kg = _costs(params, levels, demand_w, relaxed.soc[:-1], price_kg)
@@ -147,8 +161,14 @@ def _plan(
     starts = int(np.sum(engine_on & ~np.append(False, engine_on[:-1])))
     cost_kg = float(burning.sum()) + starts * engine.start_fuel_kg + PENALTY_KG * 1e-3 * short_j
     wanted = float(relaxed.soc[-1]) if solution.soc_target is None else solution.soc_target
-    cost_kg += middle * max(wanted - soc, 0.0) * MISSED
+    cost_kg += max(middle, largest) * max(wanted - soc, 0.0) * MISSED
     return cost_kg, to_bus_w(params.generator, plan_w, engine.power_max_w), engine_on
+
+
+def largest_marginal_kg(model: Model) -> float:
+    """Largest marginal fuel of the running engine for the energy of a whole SOC [kg], > 0: the
+    least that energy missing at an end may cost, whatever the co-state says."""
+    return model.numbers.missing_kg / PRICE_MULTIPLE
 
 
 def _stretches(engine_on: BoolArray, steps: int) -> list[tuple[int, int]]:
@@ -202,15 +222,16 @@ class _Part:
         if target is None:
             return above
         low = high = 1.0
-        for _ in range(SEARCH_STEPS):
+        growths = [GROWTH ** (2.0**n) for n in range(WIDENINGS)]
+        for growth in growths:
             if self.end(above)[0] >= target:
                 break
-            low, below, high = high, above, high * GROWTH
+            low, below, high = high, above, high * growth
             above = self.plan_w(high)
-        for _ in range(SEARCH_STEPS):
+        for growth in growths:
             if self.end(below)[0] <= target:
                 break
-            high, above, low = low, below, low / GROWTH
+            high, above, low = low, below, low / growth
             below = self.plan_w(low)
         while high - low > PRICE_STEP:
             middle = 0.5 * (low + high)
@@ -235,6 +256,11 @@ def _levels(params: PowertrainParams) -> _Levels:
     if ramp_w < peak_w:
         reach = math.ceil(ramp_w / spacing_w)
         spacing_w = ramp_w / reach
+    if peak_w / spacing_w > MOST_LEVELS:
+        least = peak_w / MOST_LEVELS / params.dt_s
+        raise ConfigError(
+            f"engine.ramp_w_per_s: {params.engine.ramp_w_per_s}, allowed >= {least:g} for a plan"
+        )
     crank_w = np.append(np.arange(0.0, peak_w - 1.0, spacing_w), peak_w)
     fuel_kg = fuel_rate_kg_per_s(params.engine, crank_w, np.ones(crank_w.shape, dtype=bool))
     bus_w = to_bus_w(params.generator, crank_w, peak_w)
