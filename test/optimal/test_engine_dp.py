@@ -9,6 +9,8 @@ import pytest
 from tractor_ems.drive import drive
 from tractor_ems.optimal.dp import engine_knots_w, solve
 from tractor_ems.optimal.engine_dp import (
+    MAX_VALUES,
+    REFINEMENT,
     EngineSolution,
     has_engine_state,
     nearest_end_soc,
@@ -177,6 +179,7 @@ def test_the_co_state_is_what_a_joule_at_the_end_costs():
     assert np.all(at.co_state_kg_per_j >= 0.0)
 
 
+@pytest.mark.slow
 def test_a_price_at_the_end_finds_the_target_that_it_pays_for():
     """With price p the optimum ends where it would end if told to, and costs that less p E."""
     demand_w, price = light_work_w(), 60e-9
@@ -264,3 +267,25 @@ def test_out_of_range_input_is_named(arguments, message):
 def test_a_cycle_that_is_not_a_finite_column_is_refused(demand_w):
     with pytest.raises(CycleError, match="power_demand_w"):
         solve_engine(FIELD, demand_w, 0.55, 0.55)
+
+
+def test_a_fuel_curve_has_a_knot_where_it_leaves_the_idle_rate():
+    """There the power alone burns the idle rate."""
+    paper = load_powertrain("paper")
+    idling = load_powertrain("paper:engine.idle_fuel_kg_per_s=0.0003")
+    added_w = np.setdiff1d(engine_knots_w(idling), engine_knots_w(paper))
+    assert len(added_w) == 1
+    assert fuel_rate_kg_per_s(paper.engine, added_w) == pytest.approx(0.0003, rel=1e-12)
+
+
+def test_a_long_cycle_says_what_cells_it_got():
+    """Tables that cannot hold the band take wider cells; those that can, what was asked for."""
+    demand_w, asked_j, most = light_work_w(600), 2e3 / REFINEMENT, 40_000
+    usual, small = (
+        solve_engine(FIELD, demand_w, 0.55, 0.55, cell_j=2e3, max_values=values)
+        for values in (MAX_VALUES, most)
+    )
+    assert usual.cell_j == pytest.approx(asked_j)
+    width = float(np.max(small.band[1] - small.band[0]))
+    assert small.cell_j > asked_j
+    assert 2 * (len(demand_w) + 1) * width * ENERGY_J / small.cell_j <= most

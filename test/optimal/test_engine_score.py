@@ -151,7 +151,7 @@ def test_ramp_and_minimum_times_do_not_change_the_reference():
 
 
 def test_soc_from_the_wire_scores_like_exact_soc():
-    demand_w = np.full(120, 90e3)
+    demand_w = np.full(40, 90e3)
     exact = dp_ratio(FIELD, demand_w, 0.55, 0.5487654321, 1.0)
     wire = dp_ratio(FIELD, demand_w, 0.55, float(np.float32(0.5487654321)), 1.0)
     assert wire == pytest.approx(exact, abs=1e-5)
@@ -165,4 +165,4 @@ def test_a_final_soc_the_cycle_cannot_reach_is_refused():
 def test_an_uncertified_reference_is_not_a_score(monkeypatch):
     monkeypatch.setattr(engine_certificate, "HALVING_LIMIT", 0.0)
     with pytest.raises(TractorEmsError, match="not certified"):
-        dp_ratio(FIELD, np.full(40, 70e3), 0.55, 0.5512345, 1.0)
+        dp_ratio(FIELD, np.full(20, 70e3), 0.55, 0.5512345, 1.0)
