@@ -107,4 +107,4 @@ def _residual_kg(params: PowertrainParams, solution: EngineSolution, soc_final: 
         return 0.0
     missing_j = max(solution.soc_target - soc_final, 0.0) * params.battery.energy_j
     marginal = largest_marginal_kg(model_of(params)) / params.battery.energy_j
-    return missing_j * max(float(np.median(solution.co_state_kg_per_j)), marginal)
+    return float(missing_j * max(float(np.median(solution.co_state_kg_per_j)), marginal))

@@ -40,7 +40,7 @@ REFINEMENT = 4
 
 BAND_CELLS = 120
 """Half width of that band in cells of the first pass; doubled for as long as the optimum of the
-second pass touches its edge. Narrower from the start where the tables could not hold it."""
+second pass touches its edge."""
 
 FUEL_POINTS = 4097
 """Entries of the fuel table: 62 W apart on "field"."""
@@ -149,7 +149,7 @@ def solve_engine(
     cell = _affordable(low, high, cell_j / params.battery.energy_j, max_values)
     soc, _, _, _ = _pass(params, model, demand_w, low, high, soc_initial, price_kg, cell)
     fine = cell_j / REFINEMENT / params.battery.energy_j
-    half = min(BAND_CELLS * REFINEMENT, 0.2 * max_values / len(low)) * fine
+    half = BAND_CELLS * REFINEMENT * fine
     while True:
         # The band leaves the ends of the tube what they are: there it is exact.
         band_low = np.maximum(low, np.minimum(soc - half, high))
