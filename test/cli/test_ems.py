@@ -72,6 +72,7 @@ def test_the_default_policy_ships_and_drives(capsys):
     assert abs(result["soc_final"] - 0.836) <= 0.02
 
 
+@pytest.mark.slow
 def test_dp_ends_where_it_is_told_and_certifies(capsys):
     result = document(
         capsys, "dp", "--cycle", "planter", "--soc0", "0.85", "--soc-final", "0.836", "--certify"

@@ -212,6 +212,7 @@ def noisy_bandit(tables, noise, rng):
         td_update(tables, here, action, reward, here, 0, actions - 1, 0.9, 0.1, scratch, rng)
 
 
+@pytest.mark.slow
 def test_double_q_overestimates_less_on_a_noisy_bandit():
     """The truth is 0. Mean over actions and 50 seeds: Q-learning is above 2.5, double Q within
     a tenth of that."""

@@ -111,7 +111,9 @@ def end_every_node(number, start, graph, policy_file) -> None:
     graph.remove(observer)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM]
+)
 def test_every_node_ends_with_code_0_on_a_signal(start, graph, untrained, number):
     policy_file, _ = untrained()
     end_every_node(number, start, graph, policy_file)

@@ -78,7 +78,10 @@ def test_dp_equals_enumeration_on_a_three_step_cycle(quanta, target_node):
     np.testing.assert_allclose(solution.values[0], expected, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("soc_final", [0.82, 0.836, 0.85, 0.855])
+@pytest.mark.parametrize(
+    "soc_final",
+    [0.836, *(pytest.param(soc, marks=pytest.mark.slow) for soc in (0.82, 0.85, 0.855))],
+)
 def test_below_the_best_point_the_optimum_mixes_off_and_best_power(soc_final):
     """Fuel is then the engine's energy at best efficiency: no run can be below, DP is on it."""
     energy_j = PLANTER_W.sum() * PAPER.dt_s - (0.85 - soc_final) * PAPER.battery.energy_j

@@ -100,6 +100,7 @@ def test_at_a_binding_soc_min_the_printed_reward_costs_fuel_against_dp():
     assert run.fuel_kg.sum() > 1.02 * best.fuel_kg.sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_rule_and_no_random_driving_earns_more_on_the_papers_cycle(kind: RewardKind):
     params, reward = plant(0.70), reward_of(kind)
@@ -117,6 +118,7 @@ def test_no_rule_and_no_random_driving_earns_more_on_the_papers_cycle(kind: Rewa
         assert reward_sum(run, params, reward, 0.836) <= best + 1e-6 * abs(best), policy.name
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),

@@ -45,6 +45,7 @@ def test_a_study_counts_its_sittings_and_a_second_call_trains_nothing(
     assert (one.fuel_kg, one.dp_ratio) == (other.fuel_kg, other.dp_ratio)
 
 
+@pytest.mark.slow
 def test_more_seeds_train_only_the_new_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

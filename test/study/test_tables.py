@@ -54,6 +54,7 @@ def rows_as_dicts(table: Table) -> list[dict[str, str]]:
     return list(to_json(table)["rows"])
 
 
+@pytest.mark.slow
 def test_every_table_of_the_paper_and_of_ours_is_built():
     names = set(tables_of_full())
     assert names >= PAPER_TABLES | OUR_TABLES
