@@ -26,7 +26,7 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
-_VALUE = re.compile(r"[+-]?[0-9.][0-9.eE+-]*|[A-Za-z][A-Za-z0-9_.-]*")
+_VALUE = re.compile(r"[+-]?([0-9]+[.]?[0-9]*|[.][0-9]+)([eE][+-]?[0-9]+)?|[A-Za-z][A-Za-z0-9_.-]*")
 """What may stand behind ``=`` in a changed setting."""
 
 _SHOWN = 80

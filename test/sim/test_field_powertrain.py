@@ -182,7 +182,7 @@ WRONG_SETTINGS = {
     "motor.power_max_w=1": "motor.power_max_w=1",
     "battery.soc_min=0.9": "battery.soc_min",
     "soc_initial=0.9": "allowed 0.3..0.8",
-    "dt_s=2023-13-01": "dt_s",
+    "dt_s=2023-13-01": "no value of dt_s",
     "engine.ramp_w_per_s=": "'' is no value of engine.ramp_w_per_s",
     "engine.min_on_s=yes": "engine.min_on_s",
     "engine.min_on_s=1:30": "'1:30' is no value of engine.min_on_s",
