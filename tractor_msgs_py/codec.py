@@ -21,12 +21,16 @@ from tractor_msgs_py.types import (
     CommandMode,
     PowerDemand,
     PowertrainReading,
+    Reason,
     RunInfo,
     Sample,
 )
 
 DEMAND_NAMES = ("power_demand",)
 COMMAND_NAMES = ("battery_power", "engine_power", "mode")
+REASON_NAME = "reason"
+"""Fourth entry of a command that is not the policy's own wish; others do without it."""
+
 POWERTRAIN_NAMES = (
     "engine_on",
     "time_in_state_s",
@@ -136,20 +140,38 @@ def decode_powertrain(msg: Any) -> PowertrainReading:
 
 def encode_command(sample: BatteryPowerCommand, factory: MessageFactory) -> Any:
     """BatteryPowerCommand to a message."""
-    efforts = (sample.battery_power_w, sample.engine_power_w, float(sample.mode))
-    return factory.joint_state(sample.stamp_ns, COMMAND_NAMES, efforts)
+    names: tuple[str, ...] = COMMAND_NAMES
+    efforts: tuple[float, ...] = (
+        sample.battery_power_w,
+        sample.engine_power_w,
+        float(sample.mode),
+    )
+    if sample.reason is not Reason.NONE:
+        names, efforts = (*names, REASON_NAME), (*efforts, float(sample.reason))
+    return factory.joint_state(sample.stamp_ns, names, efforts)
 
 
 def decode_command(msg: Any) -> BatteryPowerCommand:
     """Message to BatteryPowerCommand. Powers may be non-finite: refusing them is the plant's job.
 
-    Raises BagError on another layout or an unknown mode.
+    Raises BagError on another layout, an unknown mode or an unknown reason.
     """
-    battery_power_w, engine_power_w, mode = _efforts(msg, COMMAND_NAMES, topics.COMMAND.name)
-    if mode not in (0.0, 1.0, 2.0):
-        raise BagError(f"{topics.COMMAND.name}: mode {mode}, expected 0, 1 or 2")
+    where = topics.COMMAND.name
+    names: tuple[str, ...] = COMMAND_NAMES
+    if len(msg.name) > len(names):
+        names = (*names, REASON_NAME)
+    battery_power_w, engine_power_w, mode, *rest = _efforts(msg, names, where)
+    if mode not in list(CommandMode):
+        raise BagError(f"{where}: mode {mode}, expected 0, 1 or 2")
+    reason = rest[0] if rest else Reason.NONE
+    if reason not in list(Reason):
+        raise BagError(f"{where}: reason {reason}, expected 0 to {max(Reason)}")
     return BatteryPowerCommand(
-        stamp_to_ns(msg.header.stamp), battery_power_w, engine_power_w, CommandMode(int(mode))
+        stamp_to_ns(msg.header.stamp),
+        battery_power_w,
+        engine_power_w,
+        CommandMode(int(mode)),
+        Reason(int(reason)),
     )
 
 

@@ -18,6 +18,21 @@ class CommandMode(IntEnum):
     SHUTDOWN = 2
 
 
+class Reason(IntEnum):
+    """Why a command is not the policy's own wish; travels with it when it is not NONE."""
+
+    NONE = 0
+    NOT_STARTED = 1
+    OBSERVATION_STALE = 2
+    OBSERVATION_IMPLAUSIBLE = 3
+    RECOVERING = 4
+    FAULT = 5
+    POLICY_ERROR = 6
+    SHUTDOWN = 7
+    HANDOVER = 8
+    COMMAND_STALE = 9
+
+
 @dataclass(frozen=True, slots=True)
 class PowerDemand:
     """Power demand at the DC bus at ``stamp_ns``, auxiliaries included; negative is valid [W]."""
@@ -75,13 +90,15 @@ class BatteryPowerCommand:
     """A policy's answer to the observation stamped ``stamp_ns``.
 
     ``battery_power_w`` > 0 discharges. ``engine_power_w`` is 0 to say "engine off" (it is never
-    inferred from equality of two floats), NaN for no opinion.
+    inferred from equality of two floats), NaN for no opinion. ``reason`` says why it is not the
+    policy's own wish.
     """
 
     stamp_ns: int
     battery_power_w: float
     engine_power_w: float = float("nan")
     mode: CommandMode = CommandMode.NOMINAL
+    reason: Reason = Reason.NONE
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,7 @@ from tractor_msgs_py.types import (
     CommandMode,
     PowerDemand,
     PowertrainReading,
+    Reason,
     RunInfo,
 )
 
@@ -55,6 +56,21 @@ def test_float64_samples_come_back_bit_for_bit(stamp, values, on):
         BatteryPowerCommand(stamp, values[1], values[2], CommandMode.FALLBACK),
     ):
         assert over_the_wire(sample) == sample
+
+
+@pytest.mark.parametrize("reason", Reason)
+def test_a_command_says_why_it_is_not_the_policys_wish_and_only_then(reason):
+    sample = BatteryPowerCommand(1, 2.0, 3.0, CommandMode.FALLBACK, reason)
+    assert over_the_wire(sample) == sample
+    names = codec.encode(sample, FACTORY)[1].name
+    assert (codec.REASON_NAME in names) == (reason is not Reason.NONE)
+
+
+@pytest.mark.parametrize("reason", [-1.0, 0.5, max(Reason) + 1.0, math.nan])
+def test_an_unknown_reason_is_refused(reason):
+    message = FACTORY.joint_state(1, (*codec.COMMAND_NAMES, "reason"), (0.0, 0.0, 1.0, reason))
+    with pytest.raises(BagError, match="reason"):
+        codec.decode_command(message)
 
 
 @given(soc=st.floats(0, 1))
