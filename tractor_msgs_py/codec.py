@@ -9,7 +9,7 @@ import dataclasses
 import json
 import math
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from tractor_msgs_py.types import (
     BatteryPowerCommand,
     BatteryReading,
     CommandMode,
+    DutyCycleDemand,
+    DutyCycleInfo,
+    PlayerSample,
     PowerDemand,
     PowertrainReading,
     Reason,
@@ -27,6 +30,7 @@ from tractor_msgs_py.types import (
 )
 
 DEMAND_NAMES = ("power_demand",)
+DUTY_CYCLE_NAMES = ("duty_cycle_demand",)
 COMMAND_NAMES = ("battery_power", "engine_power", "mode")
 REASON_NAME = "reason"
 """Fourth entry of a command that is not the policy's own wish; others do without it."""
@@ -54,6 +58,7 @@ MIN_DT_S, MAX_DT_S = 1e-3, 3600.0
 """Step lengths that can be announced [s]."""
 
 _STAMP_END_NS = 2**63
+_Info = TypeVar("_Info", RunInfo, DutyCycleInfo)
 
 
 class MessageFactory(Protocol):
@@ -175,6 +180,27 @@ def decode_command(msg: Any) -> BatteryPowerCommand:
     )
 
 
+def encode_duty_cycle_demand(sample: DutyCycleDemand, factory: MessageFactory) -> Any:
+    """DutyCycleDemand to a message."""
+    return factory.joint_state(sample.stamp_ns, DUTY_CYCLE_NAMES, (sample.power_w,))
+
+
+def decode_duty_cycle_demand(msg: Any) -> DutyCycleDemand:
+    """Message to DutyCycleDemand. Raises BagError on another layout."""
+    (power_w,) = _efforts(msg, DUTY_CYCLE_NAMES, topics.DUTY_CYCLE_DEMAND.name)
+    return DutyCycleDemand(stamp_to_ns(msg.header.stamp), power_w)
+
+
+def encode_duty_cycle_info(sample: DutyCycleInfo, factory: MessageFactory) -> Any:
+    """DutyCycleInfo to a String holding JSON."""
+    return factory.string(json.dumps(dataclasses.asdict(sample), sort_keys=True, allow_nan=False))
+
+
+def decode_duty_cycle_info(msg: Any) -> DutyCycleInfo:
+    """String to DutyCycleInfo. Raises BagError as :func:`decode_run_info` does."""
+    return _info_of(msg, DutyCycleInfo, topics.DUTY_CYCLE_INFO.name)
+
+
 def encode_run_info(sample: RunInfo, factory: MessageFactory) -> Any:
     """RunInfo to a String holding JSON."""
     return factory.string(json.dumps(dataclasses.asdict(sample), sort_keys=True, allow_nan=False))
@@ -185,7 +211,15 @@ def decode_run_info(msg: Any) -> RunInfo:
 
     Unknown keys are ignored, so that a newer writer stays readable.
     """
-    where = topics.RUN_INFO.name
+    info = _info_of(msg, RunInfo, topics.RUN_INFO.name)
+    for name in ("soc_initial", "soc_target"):
+        if not 0.0 <= getattr(info, name) <= 1.0:
+            raise BagError(f"{topics.RUN_INFO.name}: {name} {getattr(info, name)}, allowed 0..1")
+    return info
+
+
+def _info_of(msg: Any, cls: type[_Info], where: str) -> _Info:
+    """What a latched announcement says about its steps and their stamps, checked."""
     try:
         data = json.loads(msg.data, parse_constant=_refuse_constant)
     except (ValueError, RecursionError, OverflowError) as error:
@@ -193,7 +227,7 @@ def decode_run_info(msg: Any) -> RunInfo:
     if not isinstance(data, dict):
         raise BagError(f"{where}: JSON {type(data).__name__}, expected an object")
     values: dict[str, Any] = {}
-    for field in dataclasses.fields(RunInfo):
+    for field in dataclasses.fields(cls):
         if field.name not in data:
             if field.default is dataclasses.MISSING:
                 raise BagError(f"{where}: field {field.name} is missing")
@@ -203,8 +237,8 @@ def decode_run_info(msg: Any) -> RunInfo:
         wrong = not isinstance(value, int | float) if kind is float else type(value) is not kind
         if wrong or (kind is float and isinstance(value, bool)):
             raise BagError(f"{where}: field {field.name} is {value!r}, expected {kind}")
-        values[field.name] = _finite(field.name, value) if kind is float else value
-    info = RunInfo(**values)
+        values[field.name] = _finite(where, field.name, value) if kind is float else value
+    info = cls(**values)
     if not MIN_DT_S <= info.dt_s <= MAX_DT_S:
         raise BagError(f"{where}: dt_s {info.dt_s}, allowed {MIN_DT_S}..{MAX_DT_S}")
     if not 1 <= info.steps <= MAX_STEPS:
@@ -214,9 +248,6 @@ def decode_run_info(msg: Any) -> RunInfo:
             f"{where}: t0_ns {_brief(info.t0_ns)}, allowed from 1 to where the last stamp is "
             f"below {_STAMP_END_NS}"
         )
-    for name in ("soc_initial", "soc_target"):
-        if not 0.0 <= getattr(info, name) <= 1.0:
-            raise BagError(f"{where}: {name} {getattr(info, name)}, allowed 0..1")
     return info
 
 
@@ -224,13 +255,13 @@ def _refuse_constant(text: str) -> float:
     raise ValueError(f"{text} is no JSON number")
 
 
-def _finite(name: str, value: int | float) -> float:
+def _finite(where: str, name: str, value: int | float) -> float:
     try:
         number = float(value)
     except OverflowError:
         number = math.inf
     if not math.isfinite(number):
-        raise BagError(f"{topics.RUN_INFO.name}: {name} {_brief(value)}, must be finite")
+        raise BagError(f"{where}: {name} {_brief(value)}, must be finite")
     return number
 
 
@@ -245,11 +276,13 @@ DECODERS = {
     topics.POWERTRAIN.name: decode_powertrain,
     topics.COMMAND.name: decode_command,
     topics.RUN_INFO.name: decode_run_info,
+    topics.DUTY_CYCLE_DEMAND.name: decode_duty_cycle_demand,
+    topics.DUTY_CYCLE_INFO.name: decode_duty_cycle_info,
 }
 """Relative topic name to decoder."""
 
 
-def encode(sample: Sample, factory: MessageFactory) -> tuple[topics.Topic, Any]:
+def encode(sample: Sample | PlayerSample, factory: MessageFactory) -> tuple[topics.Topic, Any]:
     """Any sample to its topic and message."""
     match sample:
         case PowerDemand():
@@ -262,3 +295,7 @@ def encode(sample: Sample, factory: MessageFactory) -> tuple[topics.Topic, Any]:
             return topics.COMMAND, encode_command(sample, factory)
         case RunInfo():
             return topics.RUN_INFO, encode_run_info(sample, factory)
+        case DutyCycleDemand():
+            return topics.DUTY_CYCLE_DEMAND, encode_duty_cycle_demand(sample, factory)
+        case DutyCycleInfo():
+            return topics.DUTY_CYCLE_INFO, encode_duty_cycle_info(sample, factory)

@@ -37,6 +37,7 @@ BATTERY = Topic("battery_state", BATTERY_STATE)
 POWERTRAIN = Topic("powertrain_state", JOINT_STATE)
 COMMAND = Topic("battery_power_command", JOINT_STATE)
 DUTY_CYCLE_DEMAND = Topic("duty_cycle_demand", JOINT_STATE)
+DUTY_CYCLE_INFO = Topic("duty_cycle_info", STRING, Qos(durability="transient_local", depth=1))
 RUN_INFO = Topic("run_info", STRING, Qos(durability="transient_local", depth=1))
 DIAGNOSTICS = Topic("/diagnostics", DIAGNOSTIC_ARRAY)
 

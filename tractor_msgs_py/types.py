@@ -146,4 +146,50 @@ class RunInfo:
         return self.t0_ns + k * self.dt_ns
 
 
+@dataclass(frozen=True, slots=True)
+class DutyCycleDemand:
+    """Demand of the duty cycle at ``stamp_ns``, without the plant's auxiliaries; negative is
+    valid [W]. A player publishes it for a plant that is told to drive it."""
+
+    stamp_ns: int
+    power_w: float
+
+
+@dataclass(frozen=True, slots=True)
+class DutyCycleInfo:
+    """The duty cycle that a player is about to publish: sent once, latched, before any demand.
+
+    Attributes:
+        replay_id: unique per player.
+        cycle, cycle_hash: name and SHA-256 of the duty cycle.
+        t0_ns: stamp of step 0, > 0; the plant's tick 0 has it too.
+        dt_s: step length [s], > 0.
+        steps: number of steps.
+        package_version: version of tractor_ems that plays.
+        command_line: what started the player.
+    """
+
+    replay_id: str
+    cycle: str
+    cycle_hash: str
+    t0_ns: int
+    dt_s: float
+    steps: int
+    package_version: str = ""
+    command_line: str = ""
+
+    @property
+    def dt_ns(self) -> int:
+        """Step length as an integer number of nanoseconds; stamps are built from it exactly."""
+        return round(self.dt_s * 1e9)
+
+    def stamp_ns(self, k: int) -> int:
+        """Stamp of step ``k`` [ns]."""
+        return self.t0_ns + k * self.dt_ns
+
+
 Sample = PowerDemand | BatteryReading | PowertrainReading | BatteryPowerCommand | RunInfo
+"""What plant and policy say to each other."""
+
+PlayerSample = DutyCycleDemand | DutyCycleInfo
+"""What a player says to a plant that drives no cycle of its own."""
