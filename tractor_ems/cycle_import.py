@@ -80,7 +80,7 @@ def _number(cell: str) -> float:
 def _from_bag(path: Path, aux_w: float | None) -> Samples:
     """Every demand message of the bag's only run, less the auxiliaries that its plant added."""
     from tractor_ems.bags.read import read_bag
-    from tractor_msgs_py.observation import refusal
+    from tractor_msgs_py.refusal import refusal
 
     runs = [run for run in read_bag(path) if run.demand]
     if len(runs) != 1:

@@ -1,8 +1,9 @@
-"""From samples to what a policy sees: joining by stamp, demand filters, refusals.
+"""From samples to what a policy sees: joining, demand filters, refusals.
 
 One :class:`ObservationBuilder` serves the live node, the bag reader and the in-process run.
 ``exact`` joins samples of equal stamp; pairing "latest values" of two topics was measured wrong
-in 1.6-100 % of ticks. Filters live only here and reset with every run id.
+in 1.6-100 % of ticks. ``sampled`` reads a vehicle's signals, each at its own rate, at every tick
+of a clock. Filters live only here and reset with every run id.
 """
 
 import math
@@ -14,9 +15,18 @@ import numpy as np
 
 from tractor_msgs_py.codec import wire_soc
 from tractor_msgs_py.errors import PolicyError
+from tractor_msgs_py.refusal import refusal
+from tractor_msgs_py.sampling import (
+    LAG_S,
+    EngineMemory,
+    Frame,
+    Sampler,
+    Sampling,
+    engine_power_w,
+)
+from tractor_msgs_py.signals import ENGINE_ON_W, OBSERVED, SignalMap, Source
 from tractor_msgs_py.trajectory import BoolArray, FloatArray
 from tractor_msgs_py.types import (
-    BatteryPowerCommand,
     BatteryReading,
     PowerDemand,
     PowertrainReading,
@@ -26,11 +36,12 @@ from tractor_msgs_py.types import (
 MAX_PENDING = 64
 """Stamps that may wait for the rest of their samples."""
 
-MAX_POWER_W = 1e9
-"""A demand beyond this is no tractor's [W]."""
-
 SIGNALS = ("power_demand_w", "soc", "powertrain_state")
 """Signals the ``exact`` mode can supply."""
+
+SAMPLED_SIGNALS = ("power_demand_w", "soc", "engine_power_w")
+"""Signals without which a ``sampled`` policy does not see enough; engine power follows from the
+bus balance where battery power is there instead."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,27 +71,40 @@ class ObservationSpec:
     """What a policy needs to see; stored in the policy file.
 
     Attributes:
-        signals: names out of :data:`SIGNALS`.
-        dt_s: the step length the policy was made for [s]; None when any will do.
+        signals: names out of :data:`SIGNALS`, or, ``sampled``, of ``signals.OBSERVED``.
+        dt_s: the step length the policy was made for [s]; None when any will do (``exact``).
         filters: demand filters, in the order of ``Observation.features``.
         mode: how samples are joined.
+        sampling: ``sampled``: how signals are read at a tick; a signal's own way for the others.
+        lag_s: ``sampled``: how long a tick waits for samples on their way [s].
     """
 
     signals: tuple[str, ...] = SIGNALS
     dt_s: float | None = None
     filters: tuple[DemandFilter, ...] = ()
-    mode: Literal["exact"] = "exact"
+    mode: Literal["exact", "sampled"] = "exact"
+    sampling: tuple[Sampling, ...] = ()
+    lag_s: float = LAG_S
 
     def __post_init__(self) -> None:
-        if self.mode != "exact":
-            raise PolicyError(f"observation mode {self.mode!r}, allowed: exact")
+        if self.mode not in ("exact", "sampled"):
+            raise PolicyError(f"observation mode {self.mode!r}, allowed: exact, sampled")
+        supplied = SIGNALS if self.mode == "exact" else OBSERVED
         for signal in self.signals:
-            if signal not in SIGNALS:
-                raise PolicyError(f"observation needs signal {signal!r}, supplied: {SIGNALS}")
+            if signal not in supplied:
+                raise PolicyError(f"observation needs signal {signal!r}, supplied: {supplied}")
+        if self.mode == "exact":
+            if self.sampling:
+                raise PolicyError("observation sampling: only in mode sampled")
+            return
+        if self.dt_s is None or not 1e-3 <= self.dt_s <= 3600.0:
+            raise PolicyError(f"observation dt_s {self.dt_s}, sampled needs 0.001..3600")
+        if not 0.0 <= self.lag_s <= self.dt_s:
+            raise PolicyError(f"observation lag_s {self.lag_s}, allowed 0..dt_s {self.dt_s}")
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for a policy file."""
-        return {
+        data: dict[str, Any] = {
             "mode": self.mode,
             "signals": list(self.signals),
             "dt_s": self.dt_s,
@@ -89,6 +113,13 @@ class ObservationSpec:
                 for f in self.filters
             ],
         }
+        if self.mode == "sampled":
+            data["sampling"] = [
+                {"signal": way.signal, "how": way.how, "max_age_s": way.max_age_s}
+                for way in self.sampling
+            ]
+            data["lag_s"] = self.lag_s
+        return data
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> "ObservationSpec":
@@ -99,6 +130,8 @@ class ObservationSpec:
                 dt_s=None if data["dt_s"] is None else float(data["dt_s"]),
                 filters=tuple(DemandFilter(**item) for item in data["filters"]),
                 mode=data["mode"],
+                sampling=tuple(Sampling(**item) for item in data.get("sampling", ())),
+                lag_s=float(data.get("lag_s", LAG_S)),
             )
         except (KeyError, TypeError, ValueError) as error:
             raise PolicyError(f"observation spec: {error!r}") from None
@@ -114,7 +147,8 @@ class Observation:
         soc: SOC with float32 resolution, 0..1.
         soc_target: the SOC this run should end at, 0..1.
         engine_on, time_in_state_s, engine_power_w: engine state before the decision.
-        charge_limit_w, discharge_limit_w, engine_limit_w: present limits, magnitudes >= 0 [W].
+        charge_limit_w, discharge_limit_w, engine_limit_w: present limits, magnitudes >= 0 [W];
+            sampled: infinite where no signal says, for ``safety.within_powertrain`` to bound.
         features: filtered demand, shape (B, F) [W].
     """
 
@@ -172,34 +206,146 @@ def filter_trace(spec: ObservationSpec, power_demand_w: FloatArray, dt_s: float)
     return features
 
 
+@dataclass(frozen=True)
+class SampledTick:
+    """One tick of a sampled run: what was known, and the observation if that was enough."""
+
+    frame: Frame
+    observation: Observation | None
+
+
+def sampler_of(spec: ObservationSpec, signals: SignalMap | None) -> Sampler:
+    """The sampler for a sampled spec.
+
+    Raises:
+        PolicyError: a signal the spec needs is not in the map.
+    """
+    names = () if signals is None else signals.names
+    for name in spec.signals:
+        balance = name == "engine_power_w" and "battery_power_w" in names
+        if name not in names and not balance:
+            raise PolicyError(
+                f"observation needs signal {name}, the signal map has {', '.join(names) or 'none'}"
+            )
+    assert signals is not None and spec.dt_s is not None
+    return Sampler(signals.signals, spec.sampling, round(spec.dt_s * 1e9), round(spec.lag_s * 1e9))
+
+
 @dataclass
 class ObservationBuilder:
-    """Joins one run's samples by equal stamp into observations of batch one.
+    """Makes one run's samples into observations of batch one.
 
-    Call :meth:`start_run` for every run_info, :meth:`add` for every sample. A sample that must
-    not be used is refused and counted in ``refusals`` by reason; it never raises.
+    Call :meth:`start_run` for every run_info, then, ``exact``, :meth:`add` for every sample, or,
+    ``sampled``, :meth:`sense` for every value of a source and :meth:`poll` as time passes. A
+    sample that must not be used is refused and counted in ``refusals`` by reason; it never
+    raises.
+
+    Args:
+        spec: what the policy needs.
+        signals: where the signals come from; ``sampled`` only.
+
+    Raises PolicyError where the map supplies less than the spec needs.
     """
 
     spec: ObservationSpec
+    signals: SignalMap | None = None
     run: RunInfo | None = None
     refusals: Counter[str] = field(default_factory=Counter)
     last_stamp_ns: int = 0
     _filters: FilterState = field(default_factory=lambda: FilterState(np.zeros((1, 0))))
     _pending: dict[int, dict[type, Any]] = field(default_factory=dict)
+    _sampler: Sampler | None = None
+    _engine: EngineMemory = field(default_factory=EngineMemory)
 
-    def start_run(self, run: RunInfo) -> None:
+    def __post_init__(self) -> None:
+        if self.spec.mode == "sampled":
+            self._sampler = sampler_of(self.spec, self.signals)
+            self._sampler.refusals = self.refusals
+
+    def start_run(self, run: RunInfo, time_scale: float = 1.0) -> None:
         """Forget the previous run. Repeating the present run id changes nothing.
 
-        Raises PolicyError where the run's step length is not the one the spec was made for.
+        Args:
+            run: what was announced, or made up for a vehicle that announces nothing.
+            time_scale: ``sampled``: seconds of stamps per second of the local clock.
+
+        Raises PolicyError where the run's step length is not the one the spec was made for; a
+        sampled policy has a clock of its own.
         """
         if self.run is not None and self.run.run_id == run.run_id:
             return
-        if self.spec.dt_s is not None and abs(self.spec.dt_s - run.dt_s) > 1e-9:
-            raise PolicyError(f"observation dt_s {run.dt_s}, the policy needs {self.spec.dt_s}")
+        spec = self.spec
+        if spec.mode == "exact" and spec.dt_s is not None and abs(spec.dt_s - run.dt_s) > 1e-9:
+            raise PolicyError(f"observation dt_s {run.dt_s}, the policy needs {spec.dt_s}")
         self.run = run
+        self._forget()
+        if self._sampler is not None:
+            self._sampler.start(run.t0_ns, time_scale)
+
+    def _forget(self) -> None:
         self.last_stamp_ns = 0
         self._filters = init_filters(self.spec, 1)
         self._pending = {}
+        self._engine = EngineMemory()
+
+    @property
+    def complaints(self) -> dict[str, str]:
+        """``sampled``: signal to the last text about an implausible value."""
+        return {} if self._sampler is None else self._sampler.complaints
+
+    def sense(
+        self, source: Source, stamp_ns: int, value: float, received_ns: int
+    ) -> list[SampledTick]:
+        """``sampled``: a source said something; the ticks that have come by it."""
+        if self._sampler is None or self.run is None:
+            self.refusals["no_run_info"] += 1
+            return []
+        ticks = self.poll(received_ns)
+        jumps = self._sampler.clock.jumps
+        self._sampler.add(source, stamp_ns, value, received_ns)
+        if self._sampler.clock.jumps != jumps:
+            self._forget()
+        return ticks + self.poll(received_ns)
+
+    def poll(self, received_ns: int) -> list[SampledTick]:
+        """``sampled``: the ticks that have come by the passing of time, oldest first."""
+        frames = [] if self._sampler is None else self._sampler.due(received_ns)
+        return [self._tick(frame) for frame in frames]
+
+    def _tick(self, frame: Frame) -> SampledTick:
+        run, values = self.run, frame.values
+        assert run is not None and self.spec.dt_s is not None
+        blind = [name for name in frame.missing if name in OBSERVED]
+        engine_w = engine_power_w(values)
+        if blind or engine_w is None:
+            for name in blind or ["engine_power_w"]:
+                self.refusals[f"{frame.missing.get(name, 'absent')}_{name}"] += 1
+            return SampledTick(frame, None)
+        on = bool(values.get("engine_on", float(engine_w > ENGINE_ON_W)) >= 0.5)
+        self._engine = self._engine.after(on, frame.stamp_ns)
+        demand_w = np.array([values["power_demand_w"]])
+        self._filters = update_filters(self.spec, self._filters, demand_w, self.spec.dt_s)
+        self.last_stamp_ns = frame.stamp_ns
+
+        def value(name: str, default: float) -> FloatArray:
+            return np.array([values.get(name, default)])
+
+        return SampledTick(
+            frame,
+            Observation(
+                stamp_ns=frame.stamp_ns,
+                power_demand_w=demand_w,
+                soc=np.atleast_1d(wire_soc(values["soc"])),
+                soc_target=np.array([run.soc_target]),
+                engine_on=np.array([on]),
+                time_in_state_s=value("time_in_state_s", self._engine.time_in_state_s),
+                engine_power_w=np.array([engine_w]),
+                charge_limit_w=value("charge_limit_w", math.inf),
+                discharge_limit_w=value("discharge_limit_w", math.inf),
+                engine_limit_w=value("engine_limit_w", math.inf),
+                features=self._filters.values_w.copy(),
+            ),
+        )
 
     def add(self, sample: PowerDemand | BatteryReading | PowertrainReading) -> Observation | None:
         """The observation that ``sample`` completes, or None.
@@ -245,47 +391,3 @@ class ObservationBuilder:
             engine_limit_w=np.array([state.engine_limit_w]),
             features=self._filters.values_w.copy(),
         )
-
-
-def refusal(
-    sample: PowerDemand | BatteryReading | PowertrainReading | BatteryPowerCommand,
-    run: RunInfo | None,
-) -> str | None:
-    """Why a sample must not be used, or None: one rule for the live node and the bag reader.
-
-    ``zero_stamp``; with a run ``stamp_outside_run`` and, in lockstep, ``stamp_off_grid``;
-    ``soc_out_of_range``, ``not_finite``, ``demand_out_of_range``. The values of a command are
-    not judged: the plant projects whatever a policy answered.
-    """
-    if sample.stamp_ns <= 0:
-        return "zero_stamp"
-    if run is not None:
-        if not run.t0_ns <= sample.stamp_ns <= run.stamp_ns(run.steps):
-            return "stamp_outside_run"
-        if run.lockstep and (sample.stamp_ns - run.t0_ns) % run.dt_ns:
-            return "stamp_off_grid"
-    match sample:
-        case PowerDemand():
-            values: tuple[float, ...] = (sample.power_w,)
-        case BatteryReading():
-            return None if 0.0 <= sample.soc <= 1.0 else "soc_out_of_range"
-        case BatteryPowerCommand():
-            return None
-        case PowertrainReading():
-            values = (
-                sample.time_in_state_s,
-                sample.engine_power_w,
-                sample.charge_limit_w,
-                sample.discharge_limit_w,
-                sample.engine_limit_w,
-                sample.applied_battery_power_w,
-                sample.applied_engine_power_w,
-                sample.fuel_kg,
-                sample.shortfall_j,
-                sample.dissipated_j,
-            )
-    if not all(math.isfinite(value) for value in values):
-        return "not_finite"
-    if isinstance(sample, PowerDemand) and abs(sample.power_w) > MAX_POWER_W:
-        return "demand_out_of_range"
-    return None

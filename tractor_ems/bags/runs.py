@@ -13,7 +13,8 @@ from typing import TypeAlias
 import numpy as np
 
 from tractor_msgs_py.errors import BagError
-from tractor_msgs_py.observation import Observation, ObservationBuilder, ObservationSpec, refusal
+from tractor_msgs_py.observation import Observation, ObservationBuilder, ObservationSpec
+from tractor_msgs_py.refusal import refusal
 from tractor_msgs_py.trajectory import Trajectory
 from tractor_msgs_py.types import (
     BatteryPowerCommand,
