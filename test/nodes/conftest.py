@@ -135,8 +135,8 @@ class Graph:
         self._folder = folder
         self._runs = 0
 
-    def node(self, name: str) -> Node:
-        node = Node(name, context=self.context)
+    def node(self, name: str, namespace: str = "") -> Node:
+        node = Node(name, context=self.context, namespace=namespace)
         self._executor.add_node(node)
         return node
 
@@ -153,8 +153,8 @@ class Graph:
     def policy(self, answerer: Answerer, name: str = "test_policy") -> PolicyNode:
         return PolicyNode(self.node(name), answerer, history_depth=10)
 
-    def peer(self, *heard: topics.Topic, name: str = "peer") -> Peer:
-        return Peer(self.node(name), heard)
+    def peer(self, *heard: topics.Topic, name: str = "peer", namespace: str = "") -> Peer:
+        return Peer(self.node(name, namespace), heard)
 
     def spin_until(self, condition: Callable[[], Any], what: str) -> None:
         deadline = time.monotonic() + DEADLINE_S
