@@ -27,6 +27,9 @@ class Lockstep(Pace):
     of the feasible set is projected, as in an in-process run, and both are counted. Every other
     command is refused and counted.
 
+    A tick whose demand has still to come from a topic is published as soon as it is there; how
+    long that may take is not judged here.
+
     Attributes:
         resends: ticks published again.
     """
@@ -38,7 +41,7 @@ class Lockstep(Pace):
         self.resends = 0
         self._answer_timeout_s = answer_timeout_s
         self._tick_since_s = 0.0
-        self._sent_s = 0.0
+        self._sent_s: float | None = 0.0
 
     def _own_counters(self) -> dict[str, int]:
         return {"resends": self.resends}
@@ -50,6 +53,8 @@ class Lockstep(Pace):
             RunAborted: no answer within the timeout, or more than one policy is connected.
         """
         refuse_second_policy(command_publishers)
+        if self._sent_s is None:
+            return self._send(now_s)
         if now_s - self._tick_since_s > self._answer_timeout_s:
             raise RunAborted(
                 f"no answer to tick {self.run.k} (stamp {self.run.stamp_ns} ns) within "
@@ -93,6 +98,9 @@ class Lockstep(Pace):
         return self._send(now_s)
 
     def _send(self, now_s: float) -> tuple[Sample, ...]:
+        if not self.run.ready:
+            self._sent_s = None
+            return ()
         self._tick_since_s = self._sent_s = now_s
         return self.run.samples()
 
@@ -102,6 +110,6 @@ class Lockstep(Pace):
         if command.mode is not CommandMode.NOMINAL:
             return f"{command.mode.name.lower()}_mode"
         if command.stamp_ns == self.run.stamp_ns:
-            return None
+            return "no_tick_in_flight" if self._sent_s is None else None
         ticks, rest = divmod(command.stamp_ns - self.run.info.t0_ns, self.run.info.dt_ns)
         return "repeated_answer" if not rest and 0 <= ticks < self.run.k else "other_stamp"

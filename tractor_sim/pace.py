@@ -27,12 +27,14 @@ class Peers:
             overtake it.
         demand_subscribers: subscribers of the power demand alone; 0 while run_info is on its way
             to all.
+        demand_ready: the demand of the first tick is there; False while a player is awaited.
     """
 
     command_publishers: int
     observation_subscribers: int
     run_info_delivered: bool
     demand_subscribers: int = 0
+    demand_ready: bool = True
 
 
 class StartGate:
@@ -59,13 +61,15 @@ class StartGate:
         """
         refuse_second_policy(peers.command_publishers)
         enough = peers.observation_subscribers >= self._needed and peers.run_info_delivered
-        if peers.command_publishers == 1 and (enough or self._partial(peers, now_s)):
+        matched = peers.command_publishers == 1 and (enough or self._partial(peers, now_s))
+        if matched and peers.demand_ready:
             self.missing = ""
             return True
         self.missing = (
             f"{peers.command_publishers} of 1 publishers on {topics.COMMAND.name}, "
             f"{peers.observation_subscribers} of {self._needed} subscribers of the observation, "
             f"{topics.RUN_INFO.name} {'' if peers.run_info_delivered else 'not '}delivered"
+            f"{'' if peers.demand_ready else f', no {topics.DUTY_CYCLE_DEMAND.name}'}"
         )
         self._since_s = now_s if self._since_s is None else self._since_s
         if 0.0 < self._timeout_s < now_s - self._since_s:
@@ -112,7 +116,11 @@ class Pace(ABC):
     def counters(self) -> dict[str, int]:
         """What people want to see: the pace's own count and refusals by reason."""
         refused = {f"refused_{reason}": count for reason, count in sorted(self.refusals.items())}
-        return {**self._own_counters(), **refused}
+        return {
+            **self._own_counters(),
+            **dict(sorted(self.run.demand_counters.items())),
+            **refused,
+        }
 
     def start(self, peers: Peers, now_s: float) -> tuple[Sample, ...]:
         """The first tick once everyone is connected, nothing before.

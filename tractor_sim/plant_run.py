@@ -5,6 +5,7 @@ node only carries samples. The physics is ``powertrain.step``, as everywhere els
 """
 
 import uuid
+from collections import Counter
 from typing import Literal
 
 import numpy as np
@@ -16,6 +17,7 @@ from tractor_msgs_py.trajectory import FloatArray, Trajectory
 from tractor_msgs_py.types import (
     DEFAULT_T0_NS,
     BatteryPowerCommand,
+    DutyCycleInfo,
     PowerDemand,
     RunInfo,
     Sample,
@@ -44,8 +46,11 @@ class PlantRun:
 
     Attributes:
         params, info: the vehicle and the run.
-        power_demand_w: demand at the bus, auxiliaries included, shape (T,) [W].
+        power_demand_w: demand at the bus, auxiliaries included, shape (T,) [W]; NaN where it comes
+            from a topic and has not come yet.
         k: the tick that waits for its command; T when the run is done.
+        held: the present tick is driven with an older demand, because its own has not come.
+        demand_counters: what happened to demand from a topic; empty for a cycle of the plant's.
     """
 
     def __init__(
@@ -55,6 +60,10 @@ class PlantRun:
         self.info = info
         self.power_demand_w = power_demand_w
         self.k = 0
+        self.held = False
+        self.demand_counters: Counter[str] = Counter()
+        self._held: set[int] = set()
+        self._newest = (-1, 0.0)
         self._state = initial_state(params, info.soc_initial)
         self._last: StepResult | None = None
         self._rows: list[tuple[float, ...]] = []
@@ -63,6 +72,26 @@ class PlantRun:
     def done(self) -> bool:
         """True after the last step."""
         return self.k >= self.info.steps
+
+    @property
+    def ready(self) -> bool:
+        """The demand of the present tick is there, or none is needed any more."""
+        return self.done or bool(np.isfinite(self.power_demand_w[self.k]))
+
+    def take_demand(self, k: int, power_w: float) -> None:
+        """Demand of step ``k``, 0..T-1, from a topic, without auxiliaries [W]; the first counts.
+
+        One that comes after its tick was driven is what later ticks hold if theirs fail to come.
+        """
+        demand_w = power_w + self.params.p_aux_w
+        if np.isnan(self.power_demand_w[k]):
+            self.power_demand_w[k] = demand_w
+        elif k in self._held:
+            self._held.remove(k)
+            self.demand_counters["demand_late"] += 1
+            self._newest = max(self._newest, (k, demand_w))
+        else:
+            self.demand_counters["demand_repeated"] += 1
 
     @property
     def stamp_ns(self) -> int:
@@ -94,6 +123,8 @@ class PlantRun:
     def apply(self, command: BatteryPowerCommand) -> StepResult:
         """Drive the present step with ``command`` (projected, whatever it holds); go on."""
         demand_w = self.power_demand_w[self.k : self.k + 1]
+        if not self.held:
+            self._newest = (self.k, float(demand_w[0]))
         before = self._state
         asked = Command(np.array([command.battery_power_w]), np.array([command.engine_power_w]))
         self._state, result = step(self.params, before, demand_w, asked)
@@ -114,6 +145,11 @@ class PlantRun:
         )
         self._last = result
         self.k += 1
+        self.held = not self.ready and not self.info.lockstep
+        if self.held:
+            self.power_demand_w[self.k] = self._newest[1]
+            self._held.add(self.k)
+            self.demand_counters["demand_held"] += 1
         return result
 
     def trajectory(self) -> Trajectory:
@@ -139,7 +175,7 @@ class PlantRun:
 
 def prepare_run(
     powertrain: str,
-    cycle: str,
+    cycle: str | DutyCycleInfo,
     soc_initial: float = UNSET_SOC,
     soc_target: float = UNSET_SOC,
     mode: Literal["lockstep", "real_time"] = "lockstep",
@@ -150,7 +186,7 @@ def prepare_run(
 
     Args:
         powertrain: name or YAML file.
-        cycle: name or CSV file.
+        cycle: name or CSV file; or what a player announced, whose demand is still to come.
         soc_initial: fraction; :data:`UNSET_SOC` is the powertrain's.
         soc_target: fraction; :data:`UNSET_SOC` is the powertrain's, or where the run starts.
         mode: whether the plant waits for the answer to each tick.
@@ -162,31 +198,37 @@ def prepare_run(
         CycleError: unknown or malformed cycle, or one of another step length.
     """
     params = load_powertrain(powertrain)
-    duty = load_cycle(cycle)
+    duty = cycle if isinstance(cycle, DutyCycleInfo) else load_cycle(cycle)
+    name = duty.cycle if isinstance(duty, DutyCycleInfo) else duty.name
     if abs(duty.dt_s - params.dt_s) > 1e-9:
         raise CycleError(
-            f"cycle {duty.name}: dt_s {duty.dt_s}, powertrain {params.name} needs {params.dt_s} "
+            f"cycle {name}: dt_s {duty.dt_s}, powertrain {params.name} needs {params.dt_s} "
             f"(ems cycle import --dt {params.dt_s:g} resamples)"
         )
     initial = params.soc_initial if soc_initial == UNSET_SOC else soc_initial
     target = params.soc_target if soc_target == UNSET_SOC else soc_target
     target = initial if target is None else target
     low, high = params.battery.soc_min, params.battery.soc_max
-    for name, value in (("soc_initial", initial), ("soc_target", target)):
+    for parameter, value in (("soc_initial", initial), ("soc_target", target)):
         if not low <= value <= high:
             raise ConfigError(
-                f"parameter {name}: {value}, allowed {low}..{high} of powertrain {params.name}, "
-                f"or {UNSET_SOC} for its default"
+                f"parameter {parameter}: {value}, allowed {low}..{high} of powertrain "
+                f"{params.name}, or {UNSET_SOC} for its default"
             )
+    if isinstance(duty, DutyCycleInfo):
+        demand_w, digest, t0_ns = np.full(duty.steps, np.nan), duty.cycle_hash, duty.t0_ns
+    else:
+        demand_w, digest = duty.power_demand_w + params.p_aux_w, cycle_hash(duty)
+        t0_ns = DEFAULT_T0_NS
     info = RunInfo(
         run_id=uuid.uuid4().hex,
-        cycle=duty.name,
-        cycle_hash=cycle_hash(duty),
+        cycle=name,
+        cycle_hash=digest,
         powertrain=params.name,
         powertrain_hash=powertrain_hash(params),
-        t0_ns=DEFAULT_T0_NS,
+        t0_ns=t0_ns,
         dt_s=params.dt_s,
-        steps=len(duty),
+        steps=len(demand_w),
         p_aux_w=params.p_aux_w,
         soc_initial=initial,
         soc_target=target,
@@ -195,4 +237,4 @@ def prepare_run(
         package_version=__version__,
         command_line=command_line,
     )
-    return PlantRun(params, info, duty.power_demand_w + params.p_aux_w)
+    return PlantRun(params, info, demand_w)

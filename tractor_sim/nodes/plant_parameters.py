@@ -6,12 +6,15 @@ No node in here.
 from collections.abc import Mapping
 from typing import Any
 
+from tractor_msgs_py import topics
 from tractor_msgs_py.errors import ConfigError
+from tractor_msgs_py.provenance import command_line
 from tractor_msgs_py.ros.shell import Parameter
 from tractor_msgs_py.ros.wire import HISTORY_DEPTH
+from tractor_msgs_py.types import DutyCycleInfo
 from tractor_sim.lockstep import Lockstep
 from tractor_sim.pace import Pace
-from tractor_sim.plant_run import UNSET_SOC, PlantRun
+from tractor_sim.plant_run import UNSET_SOC, PlantRun, prepare_run
 from tractor_sim.real_time import RealTime
 
 WALL = "s wall clock"
@@ -24,6 +27,20 @@ MIN_PERIOD_S = 0.005
 PARAMETERS = (
     Parameter("powertrain", "paper", "powertrain, a shipped name or a YAML file"),
     Parameter("cycle", "planter", "duty cycle, a shipped name or a CSV file"),
+    Parameter(
+        "demand",
+        "cycle",
+        f"drive the cycle above, or what a player publishes on {topics.DUTY_CYCLE_DEMAND.name}",
+        choices=("cycle", "topic"),
+    ),
+    Parameter(
+        "demand_timeout_s",
+        5.0,
+        "demand:=topic: end the run when the demand of a tick is missing for this long",
+        WALL,
+        0.01,
+        3600,
+    ),
     Parameter(
         "soc_initial", UNSET_SOC, "SOC at the start, -1 for the powertrain's", "fraction", -1, 1
     ),
@@ -63,6 +80,22 @@ PARAMETERS = (
     Parameter("command_line", "", "what to record as the origin of the run, empty for its own"),
     HISTORY_DEPTH,
 )
+
+
+def run_of(values: Mapping[str, Any], announced: DutyCycleInfo | None = None) -> PlantRun:
+    """The run that was asked for, over a cycle of the plant's own or the one a player announced.
+
+    Raises as ``prepare_run`` does.
+    """
+    return prepare_run(
+        values["powertrain"],
+        values["cycle"] if announced is None else announced,
+        values["soc_initial"],
+        values["soc_target"],
+        values["mode"],
+        values["expected_recorders"],
+        values["command_line"] or command_line(),
+    )
 
 
 def pace_of(run: PlantRun, values: Mapping[str, Any]) -> tuple[Pace, float]:

@@ -1,6 +1,7 @@
 """The plant as a ROS node: drives one duty cycle and ends. No physics and no protocol in here.
 
-``plant_run`` is the plant, ``lockstep`` and ``real_time`` decide when it steps.
+``plant_run`` is the plant, ``lockstep`` and ``real_time`` decide when it steps, ``topic_plant``
+brings it the demand of a player.
 """
 
 import sys
@@ -17,16 +18,15 @@ from rclpy.publisher import Publisher
 from tractor_msgs_py import topics
 from tractor_msgs_py.codec import decode_command, encode
 from tractor_msgs_py.errors import BagError
-from tractor_msgs_py.provenance import command_line
 from tractor_msgs_py.ros.delivery import Delivery
 from tractor_msgs_py.ros.diagnostics import PERIOD_S, diagnostic_array
 from tractor_msgs_py.ros.messages import RosMessages
 from tractor_msgs_py.ros.shell import run_node
 from tractor_msgs_py.ros.wire import publish_on, subscribe_to
 from tractor_msgs_py.types import Sample
-from tractor_sim.nodes.plant_parameters import PARAMETERS, pace_of
+from tractor_sim.nodes.plant_parameters import PARAMETERS, pace_of, run_of
 from tractor_sim.pace import Peers
-from tractor_sim.plant_run import prepare_run
+from tractor_sim.plant_run import PlantRun
 from tractor_sim.run_files import clear_run, line_of, summary, write_run
 
 DELIVERY_S = 5.0
@@ -36,17 +36,9 @@ DELIVERY_S = 5.0
 class PlantSim:
     """Carries samples between the topics and the state machine that steps the plant."""
 
-    def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
+    def __init__(self, node: Node, values: Mapping[str, Any], run: PlantRun | None = None) -> None:
         self._node, self._factory = node, RosMessages()
-        self._run = prepare_run(
-            values["powertrain"],
-            values["cycle"],
-            values["soc_initial"],
-            values["soc_target"],
-            values["mode"],
-            values["expected_recorders"],
-            values["command_line"] or command_line(),
-        )
+        self._run = run_of(values) if run is None else run
         self._pace, poll_s = pace_of(self._run, values)
         self._output = Path(values["output"]) if values["output"] else None
         if self._output is not None:
@@ -59,7 +51,7 @@ class PlantSim:
         self._commands = subscribe_to(node, topics.COMMAND, self._on_command)
         self._diagnostics = publish_on(node, topics.DIAGNOSTICS)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(poll_s, self._poll, clock=steady)
+        node.create_timer(poll_s, self.poll, clock=steady)
         node.create_timer(PERIOD_S, self._diagnose, clock=steady)
         self._publish((self._run.info,))
         self._beginning, self._end = Delivery([self._message(self._run.info)]), Delivery([])
@@ -82,9 +74,16 @@ class PlantSim:
             delivered,
             # Who has subscribed run_info must have it before any tick.
             counts[topics.POWER_DEMAND.name] if delivered or not announced else 0,
+            self._run.ready,
         )
 
-    def _poll(self) -> None:
+    @property
+    def started(self) -> bool:
+        """The first tick is out."""
+        return self._pace.started
+
+    def poll(self) -> None:
+        """Do what it is time for; called on a timer, and when something was waited for."""
         now_s = time.monotonic()
         if self._done_s is not None:
             late = now_s - self._done_s > DELIVERY_S
@@ -139,7 +138,9 @@ class PlantSim:
 
 def main() -> int:
     """Entry point."""
-    return run_node("plant_sim", PARAMETERS, PlantSim)
+    from tractor_sim.nodes.topic_plant import build  # which builds on this module
+
+    return run_node("plant_sim", PARAMETERS, build)
 
 
 if __name__ == "__main__":
