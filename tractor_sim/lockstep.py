@@ -43,7 +43,7 @@ class Lockstep(Pace):
         self._tick_since_s = 0.0
         self._sent_s: float | None = 0.0
 
-    def _own_counters(self) -> dict[str, int]:
+    def _own_counters(self) -> dict[str, int | str]:
         return {"resends": self.resends}
 
     def poll(self, command_publishers: int, now_s: float) -> tuple[Sample, ...]:

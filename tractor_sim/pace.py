@@ -113,7 +113,7 @@ class Pace(ABC):
         return self.run.done
 
     @property
-    def counters(self) -> dict[str, int]:
+    def counters(self) -> dict[str, int | str]:
         """What people want to see: the pace's own count and refusals by reason."""
         refused = {f"refused_{reason}": count for reason, count in sorted(self.refusals.items())}
         return {
@@ -148,5 +148,5 @@ class Pace(ABC):
         """Samples of the first tick, published at ``now_s``."""
 
     @abstractmethod
-    def _own_counters(self) -> dict[str, int]:
+    def _own_counters(self) -> dict[str, int | str]:
         """Counters beside the refusals."""

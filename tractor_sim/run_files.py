@@ -8,6 +8,7 @@ import csv
 import io
 import json
 import tempfile
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ COLUMNS = tuple(field.name for field in fields(Trajectory) if field.name != "soc
 _TYPES: dict[str, Any] = {"stamp_ns": np.int64, "engine_on": np.bool_}
 
 
-def summary(run: PlantRun, counters: dict[str, int]) -> dict[str, Any]:
+def summary(run: PlantRun, counters: Mapping[str, int | str]) -> dict[str, Any]:
     """A finished run in numbers, as plain JSON data; efficiency is null when no fuel was burnt."""
     return {
         "run_id": run.info.run_id,
@@ -37,7 +38,7 @@ def summary(run: PlantRun, counters: dict[str, int]) -> dict[str, Any]:
         "soc_initial": run.info.soc_initial,
         "soc_target": run.info.soc_target,
         **run_figures(run.trajectory(), run.params),
-        "counters": counters,
+        "counters": dict(counters),
         "package_version": run.info.package_version,
         "command_line": run.info.command_line,
     }
@@ -47,7 +48,8 @@ def line_of(result: dict[str, Any]) -> str:
     """The summary in one line, for people."""
     efficiency = result["efficiency"]
     shown = "no fuel burnt" if efficiency is None else f"efficiency {efficiency:.2%}"
-    troubles = [f"{name} {count}" for name, count in result["counters"].items() if count]
+    counts = {name: n for name, n in result["counters"].items() if not isinstance(n, str)}
+    troubles = [f"{name} {count}" for name, count in counts.items() if count]
     return (
         f"{result['cycle']} on {result['powertrain']}: {result['steps']} steps, "
         f"fuel {result['fuel_kg']:.4f} kg ({result['fuel_gal']:.4f} gal), {shown}, "

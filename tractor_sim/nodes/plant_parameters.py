@@ -73,6 +73,22 @@ PARAMETERS = (
     ),
     Parameter("command_timeout_s", 2.0, "real time: oldest command obeyed", WALL, 0.01, 60),
     Parameter(
+        "recover_after",
+        1,
+        "real time: good commands in a row until a policy that was lost is obeyed again",
+        "commands",
+        1,
+        1000,
+    ),
+    Parameter(
+        "ramp_w_per_s",
+        0.0,
+        "real time: most change of the generator's set-point, 0 for the powertrain's own limits",
+        "W/s",
+        0,
+        1e9,
+    ),
+    Parameter(
         "output",
         "",
         "folder for trajectory.csv and result.json, empty for none; an old result is removed",
@@ -110,5 +126,12 @@ def pace_of(run: PlantRun, values: Mapping[str, Any]) -> tuple[Pace, float]:
     period_s = values["period_s"] or run.params.dt_s
     if period_s < MIN_PERIOD_S:
         raise ConfigError(f"parameter period_s: {period_s:g}, allowed {MIN_PERIOD_S}..60 or 0")
-    pace = RealTime(run, period_s, values["command_timeout_s"], match_timeout_s)
+    pace = RealTime(
+        run,
+        period_s,
+        values["command_timeout_s"],
+        match_timeout_s,
+        values["recover_after"],
+        values["ramp_w_per_s"],
+    )
     return pace, min(POLL_S, period_s / 2)
