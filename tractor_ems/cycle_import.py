@@ -86,7 +86,7 @@ def _from_bag(path: Path, aux_w: float | None) -> Samples:
     if len(runs) != 1:
         raise BagError(f"{path}: {len(runs)} runs with a power demand, a cycle needs exactly one")
     info = runs[0].info
-    demand = _demand_messages(path, runs[0].namespace)
+    demand = demand_messages(path, runs[0].namespace)
     reasons = [refusal(sample, info) or "" for sample in demand]
     # What is no number or too large has a place of its own in the account.
     refused = ["" if r in ("not_finite", "demand_out_of_range") else r for r in reasons]
@@ -122,7 +122,7 @@ def _less(samples: Samples, aux_w: float, known_from: str) -> Samples:
     )
 
 
-def _demand_messages(path: Path, namespace: str) -> list[PowerDemand]:
+def demand_messages(path: Path, namespace: str) -> list[PowerDemand]:
     """The demand of one tractor in the order of its reception, refused samples and repeats too.
 
     The bag has been read once before: it is readable and its topics are the contract's.
