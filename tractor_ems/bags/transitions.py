@@ -134,7 +134,7 @@ def cycle_of_bag(path: Path) -> DutyCycle:
     Raises:
         BagError: the bag cannot be read, holds several runs, or samples are missing in it.
     """
-    found = [trace for run in read_bag(path) for trace in _demand_traces(run, str(path), "")]
+    found = [trace for run in read_bag(path) for trace in demand_traces(run, str(path), "")]
     if len(found) != 1:
         raise BagError(f"{path}: {len(found)} stretches of demand, a cycle needs exactly one")
     trace = found[0]
@@ -150,7 +150,7 @@ def cycle_of_bag(path: Path) -> DutyCycle:
 def traces_of(run: Run, bag: str = "", digest: str = "") -> list[Trace]:
     """The traces of one run: one, none, or several where samples are missing."""
     if run.info is None or not any(run.driven):
-        return _demand_traces(run, bag, digest)
+        return demand_traces(run, bag, digest)
     return _driven_traces(run, bag, digest)
 
 
@@ -254,7 +254,7 @@ def _driven_traces(run: Run, bag: str, digest: str) -> list[Trace]:
     return traces
 
 
-def _demand_traces(run: Run, bag: str, digest: str) -> list[Trace]:
+def demand_traces(run: Run, bag: str, digest: str) -> list[Trace]:
     """Demand alone: cut where samples are missing, the step from the stamps."""
     info = run.info
     stamp_ns = np.array(list(run.demand), dtype=np.int64)
