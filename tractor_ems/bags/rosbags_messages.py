@@ -36,6 +36,15 @@ def type_hash(type_name: str) -> str:
     return typestore().hash_rihs01(type_name)
 
 
+def has_header(type_name: str) -> bool | None:
+    """Whether messages of a type begin with a std_msgs/Header; None: no type of ROS 2 Jazzy."""
+    found = typestore().fielddefs.get(type_name)
+    if found is None:
+        return None
+    fields = found[1]
+    return bool(fields) and fields[0][0] == "header" and fields[0][1][1] == "std_msgs/msg/Header"
+
+
 def serialize(message: Any, type_name: str) -> bytes:
     """Message to CDR bytes; equal messages give equal bytes (rclpy leaves random padding)."""
     return bytes(typestore().serialize_cdr(message, type_name))
