@@ -90,12 +90,18 @@ class _Track:
             del self.stamps_ns[:first], self.values[:first]
 
 
+def _way(signal: MappedSignal, ways: Mapping[str, Sampling]) -> Sampling:
+    """As the vehicle's map says, or else the policy, or else the definition."""
+    way = ways.get(signal.name, default_sampling(signal.name))
+    return Sampling(signal.name, signal.how or way.how, signal.max_age_s or way.max_age_s)
+
+
 class Sampler:
     """Buffers the samples of one run and reads them at every tick.
 
     Args:
         signals: what to sample.
-        sampling: per signal how; the definition's way for the others.
+        sampling: per signal how, where the map does not say; the definition's way for the others.
         dt_ns, lag_ns: the period and how long a tick waits for late samples [ns].
 
     Attributes:
@@ -114,7 +120,7 @@ class Sampler:
         self.complaints: dict[str, str] = {}
         self.clock = StampClock()
         ways = {way.signal: way for way in sampling}
-        self._signals = [(s, ways.get(s.name, default_sampling(s.name))) for s in signals]
+        self._signals = [(s, _way(s, ways)) for s in signals]
         self._dt_ns, self._lag_ns = dt_ns, lag_ns
         self._horizon_ns = 2 * dt_ns + round(
             1e9 * max((way.max_age_s for _, way in self._signals), default=0.0)
