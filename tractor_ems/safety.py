@@ -79,15 +79,15 @@ def within_powertrain(
     if dt_s is not None and dt_s != params.dt_s:
         params = replace(params, dt_s=dt_s)
     peak_w = params.engine.power_max_w
+    known = (observation.soc >= 0.0) & (observation.soc <= 1.0)
     waited_s, power_w = observation.time_in_state_s, observation.engine_power_w
     state = PlantState(
-        soc=np.where(np.isfinite(observation.soc), observation.soc, params.battery.soc_min),
+        soc=np.where(known, observation.soc, params.battery.soc_min),
         engine_on=observation.engine_on,
         time_in_state_s=np.where(np.isfinite(waited_s), waited_s, math.inf),
         engine_power_w=np.clip(np.where(np.isfinite(power_w), power_w, peak_w), 0.0, peak_w),
     )
     own = power_limits(params, state)
-    known = np.isfinite(observation.soc)
     return replace(
         observation,
         charge_limit_w=_smaller_w(observation.charge_limit_w, np.where(known, own.charge_w, 0.0)),
