@@ -99,6 +99,7 @@ setup(
     cmdclass={"install_data": InstallDataAndLaunchers},
     zip_safe=False,
     install_requires=[
+        "lz4>=4",
         "matplotlib>=3.8",
         "mcap>=1.2",
         "numba>=0.60",
