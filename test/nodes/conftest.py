@@ -166,6 +166,11 @@ class Graph:
         for _ in range(times):
             self._executor.spin_once(timeout_sec=0.02)
 
+    def spin_to(self, due_s: float) -> None:
+        """Spin until ``time.monotonic()`` is ``due_s``."""
+        while (left_s := due_s - time.monotonic()) > 0.0:
+            self._executor.spin_once(timeout_sec=left_s)
+
     def drive(self, plant: PlantSim) -> tuple[Trajectory, dict[str, Any]]:
         """Spin until the plant is done, take it off the graph and return its result."""
         self.spin_until(lambda: plant.finished() is not None, "the end of the run")

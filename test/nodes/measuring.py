@@ -1,0 +1,167 @@
+"""What the measuring scripts beside it share: a stage with real processes, quantiles, and sections
+that become one table on the screen, one JSON file and one place in docs/measured.md."""
+
+import json
+import os
+import platform
+import shlex
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import domain_coordinator
+import numpy as np
+from conftest import BIN, Graph, Process
+from rich.console import Console
+from rich.table import Table
+
+from tractor_msgs_py.atomic import write_json
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = ROOT / "docs" / "data" / "measured.json"
+_STARTER = "import sys; from tractor_ems import executables; sys.exit(executables.{name}())"
+
+
+@dataclass(frozen=True)
+class Section:
+    """One measurement.
+
+    Attributes:
+        title: what was measured.
+        columns, rows: the table, as text.
+        figures: the raw numbers behind it.
+        notes: what a reader must know, failures first.
+    """
+
+    title: str
+    columns: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+    figures: dict[str, Any]
+    notes: list[str] = field(default_factory=list)
+
+
+class Stage:
+    """A ROS domain of its own with a graph in this process and nodes in others."""
+
+    def __init__(self, graph: Graph, folder: Path) -> None:
+        self.graph, self.folder = graph, folder
+        self._started: list[Process] = []
+
+    def start(self, name: str, **parameters: Any) -> Process:
+        """An executable with its parameters; ended with the stage at the latest."""
+        command = [str(BIN / name)]
+        if not (BIN / name).exists():  # an installation that is older than the node
+            command = [sys.executable, "-c", _STARTER.format(name=name)]
+        if parameters:
+            command.append("--ros-args")
+        for key, value in parameters.items():
+            command += ["-p", f"{key}:={value}"]
+        self._started.append(Process(name, command, self.folder))
+        return self._started[-1]
+
+    def end(self, process: Process) -> int:
+        """Terminate and reap; the exit code."""
+        return process.end(signal.SIGTERM) if process.process.poll() is None else process.end()
+
+    def close(self) -> None:
+        """End what is left."""
+        for process in self._started:
+            if process.process.poll() is None:
+                process.end(signal.SIGKILL)
+
+
+@contextmanager
+def stage() -> Iterator[Stage]:
+    """A stage that nobody else on this machine hears."""
+    with domain_coordinator.domain_id() as domain, tempfile.TemporaryDirectory() as folder:
+        os.environ |= {
+            "ROS_DOMAIN_ID": str(domain),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "ROS_LOG_DIR": str(Path(folder) / "ros_log"),
+        }
+        os.environ.pop("ROS_LOCALHOST_ONLY", None)
+        graph = Graph(domain, Path(folder))
+        made = Stage(graph, Path(folder))
+        try:
+            yield made
+        finally:
+            made.close()
+            graph.close()
+
+
+def quantiles(values: Sequence[float], scale: float = 1.0) -> dict[str, float]:
+    """Least, middle, 99 % and greatest; the 99 % one is a value that occurred."""
+    array = np.sort(np.asarray(values, dtype=np.float64)) * scale
+    if not array.size:
+        return {}
+    near = float(np.quantile(array, 0.99, method="higher"))
+    return {
+        "min": round(float(array[0]), 4),
+        "p50": round(float(np.median(array)), 4),
+        "p99": round(near, 4),
+        "max": round(float(array[-1]), 4),
+    }
+
+
+def shown(found: dict[str, float], *names: str, digits: int = 3) -> tuple[str, ...]:
+    """Quantiles as text, a dash where nothing was measured."""
+    return tuple(f"{found[name]:.{digits}f}" if found else "-" for name in names)
+
+
+def machine() -> dict[str, Any]:
+    """What the figures were measured on and how busy it was with other work."""
+    return {
+        "cores": os.cpu_count(),
+        "processor": _processor(),
+        "python": platform.python_version(),
+        "load_before": round(os.getloadavg()[0], 1),
+    }
+
+
+def _command() -> str:
+    """The command line without what only says where to put the figures."""
+    given, kept = list(sys.argv), [f"python test/nodes/{Path(sys.argv[0]).name}"]
+    for before, word in pairwise(given):
+        if "--out" not in (before, word):
+            kept.append(shlex.quote(word))
+    return " ".join(kept)
+
+
+def _processor() -> str:
+    for line in Path("/proc/cpuinfo").read_text().splitlines():
+        if line.startswith("model name"):
+            return " ".join(line.partition(":")[2].split())
+    return platform.machine()
+
+
+def publish(
+    section: Section, before: dict[str, Any], out: Path | None, record: str | None
+) -> None:
+    """Show a section, write it to ``out``, and keep it for docs/measured.md as ``record``."""
+    table = Table(title=section.title)
+    for column in section.columns:
+        table.add_column(column)
+    for row in section.rows:
+        table.add_row(*row)
+    console = Console(soft_wrap=True)
+    console.print(table)
+    for note in section.notes:
+        console.print(note, markup=False)
+    document = {
+        **asdict(section),
+        "command": _command(),
+        "date": time.strftime("%Y-%m-%d"),
+        "machine": before | {"load_after": round(os.getloadavg()[0], 1)},
+    }
+    if out is not None:
+        write_json(out, document)
+    if record is not None:
+        kept = json.loads(DATA.read_text()) if DATA.exists() else {}
+        write_json(DATA, kept | {record: document})
