@@ -4,7 +4,8 @@ import math
 
 import pytest
 
-from tractor_msgs_py.types import BatteryPowerCommand, CommandMode
+from tractor_msgs_py.errors import ConfigError
+from tractor_msgs_py.types import BatteryPowerCommand, CommandMode, Reason
 from tractor_sim.pace import Peers
 from tractor_sim.real_time import RealTime, held_command
 
@@ -133,3 +134,116 @@ def test_a_dead_policy_does_not_keep_the_run_from_its_end(plant):
         now_s += 1.0
         plant.poll(0, now_s)
     assert plant.fallback_ticks == plant.run.info.steps
+
+
+def test_out_of_range_is_what_engine_and_battery_together_never_give(plant):
+    plant.offer(command(plant, 525.1e3), 1, 0.4)
+    plant.offer(command(plant, -1e308), 1, 0.5)
+    plant.poll(1, 1.0)
+    assert plant.refusals == {"out_of_range": 2}
+    assert plant.fallback_ticks == 1
+
+
+def test_what_is_in_range_but_not_feasible_is_projected(plant):
+    plant.offer(command(plant, 500e3), 1, 0.5)
+    plant.poll(1, 1.0)
+    assert plant.run.trajectory().battery_power_w[0] == 60e3  # all of the demand
+    assert plant.fallback_ticks == 0
+
+
+def test_of_a_flood_the_newest_counts_and_the_rest_is_counted(plant):
+    for k in range(100):
+        plant.offer(command(plant, 100.0 * k), 1, 0.001 * k)
+    plant.poll(1, 1.0)
+    assert plant.run.trajectory().battery_power_w[0] == 9900.0
+    assert plant.refusals == {"flood": 80}
+    plant.poll(1, 2.0)
+    assert plant.run.trajectory().engine_power_w[1] == 60e3 - 9900.0  # nothing was queued
+
+
+def test_a_policy_of_another_rate_answers_between_the_plants_ticks(plant):
+    stamp_ns = plant.run.stamp_ns
+    plant.offer(BatteryPowerCommand(stamp_ns, 10e3), 1, 0.1)
+    plant.offer(BatteryPowerCommand(stamp_ns + 600_000_000, 20e3), 1, 0.7)
+    plant.offer(BatteryPowerCommand(stamp_ns + 500_000_000, 30e3), 1, 0.8)
+    plant.poll(1, 1.0)
+    assert plant.run.trajectory().battery_power_w[0] == 20e3
+    assert plant.refusals == {"out_of_order": 1}
+    for now_s in (2.0, 3.0, 4.0):  # 2.5 s after 0.6
+        plant.poll(1, now_s)
+    assert plant.fallback_ticks == 1
+
+
+def test_what_was_sent_before_a_hand_over_is_not_obeyed_after_it(plant):
+    plant.poll(1, 1.0)
+    plant.offer(command(plant, 10e3), 1, 1.1)
+    plant.offer(command(plant, 0.0, mode=CommandMode.SHUTDOWN), 1, 1.2)
+    plant.offer(command(plant, 20e3, ticks=-1), 1, 1.3)
+    plant.poll(1, 2.0)
+    assert plant.refusals == {"shutdown_mode": 1, "out_of_order": 1}
+    assert plant.fallback_ticks == 2
+
+
+def told(plant) -> tuple[str | int, str | int]:
+    return plant.counters["condition"], plant.counters["reason"]
+
+
+def test_condition_and_reason_are_told(plant):
+    assert told(plant) == ("INIT", "NOT_STARTED")
+    plant.offer(command(plant, 10e3), 1, 0.5)
+    assert told(plant) == ("NOMINAL", "NONE")
+    for now_s in (1.0, 2.0, 2.51):
+        plant.poll(1, now_s)
+    assert told(plant) == ("STALE", "COMMAND_STALE")
+    plant.offer(command(plant, 0.0, mode=CommandMode.SHUTDOWN), 1, 2.6)
+    assert told(plant) == ("STALE", "SHUTDOWN")
+    said = command(plant, 0.0, mode=CommandMode.FALLBACK, reason=Reason.OBSERVATION_IMPLAUSIBLE)
+    plant.offer(said, 1, 2.7)
+    assert told(plant) == ("STALE", "OBSERVATION_IMPLAUSIBLE")
+    plant.poll(2, 3.0)
+    assert told(plant) == ("STALE", "HANDOVER")
+    plant.offer(command(plant, 10e3), 1, 3.1)
+    assert told(plant) == ("NOMINAL", "NONE")
+    assert plant.counters["fallback_handover"] == plant.counters["fallback_ticks"] == 1
+
+
+def test_refused_commands_never_latch_a_fault(plant):
+    for _ in range(2000):
+        plant.offer(command(plant, math.nan), 1, 0.5)
+    plant.offer(command(plant, 10e3), 1, 0.6)
+    assert told(plant) == ("NOMINAL", "NONE")
+
+
+def test_a_policy_that_was_lost_is_obeyed_after_enough_good_ticks(make_run):
+    plant = RealTime(make_run(mode="real_time"), 1.0, 1.5, recover_after=3)
+    plant.start(EVERYONE, 0.0)
+    plant.offer(command(plant, 10e3), 1, 0.1)
+    for now_s in (1.0, 2.0):  # the second without an answer within 1.5 s
+        plant.poll(1, now_s)
+    fallbacks = []
+    for now_s in (3.0, 4.0, 5.0):
+        for _ in range(10):  # as often as it likes: ticks count
+            plant.offer(command(plant, 10e3), 1, now_s - 0.5)
+        plant.poll(1, now_s)
+        fallbacks.append(plant.fallback_ticks)
+    assert fallbacks == [2, 3, 3]
+
+
+def test_the_generator_keeps_the_plants_ramp_when_the_fallback_law_takes_over(make_run):
+    plant = RealTime(make_run(mode="real_time"), 1.0, 1.5, ramp_w_per_s=20e3)
+    plant.start(EVERYONE, 0.0)
+    now_s = 0.0
+    while not plant.done:
+        now_s += 1.0
+        if now_s < 4.0:
+            plant.offer(command(plant, -40e3), 1, now_s - 0.5)
+        plant.poll(1, now_s)
+    engine_w = plant.run.trajectory().engine_power_w
+    assert engine_w.tolist() == [20e3, 40e3, 60e3, 80e3, 60e3, 80e3]
+    assert plant.fallback_ticks == 3
+
+
+@pytest.mark.parametrize("changes", [{"recover_after": 0}, {"ramp_w_per_s": -1.0}])
+def test_a_setting_out_of_range_is_refused_before_the_run(make_run, changes):
+    with pytest.raises(ConfigError, match=f"^{next(iter(changes))}: "):
+        RealTime(make_run(mode="real_time"), 1.0, 1.5, **changes)
