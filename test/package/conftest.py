@@ -1,11 +1,12 @@
 """Installs the package the ways a user does, with pip and with colcon, into scratch folders."""
 
+import functools
 import os
 import shutil
 import subprocess
 import sys
 import sysconfig
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -32,7 +33,18 @@ class Installation:
         return self.prefix / "share" / "tractor_ems"
 
     def executable(self, name: str) -> Path:
-        return self.prefix / "lib" / "tractor_ems" / name
+        """Return what ``ros2 run tractor_ems NAME`` starts: by the index, then by walking lib."""
+        prefixes = [Path(p) for p in self.env["AMENT_PREFIX_PATH"].split(os.pathsep)]
+        marker = Path("share", "ament_index", "resource_index", "packages", "tractor_ems")
+        prefix = next(p for p in prefixes if (p / marker).is_file())
+        found = [
+            Path(folder, file)
+            for folder, _, files in os.walk(prefix / "lib" / "tractor_ems")
+            for file in files
+            if file == name and os.access(Path(folder, file), os.X_OK)
+        ]
+        assert len(found) == 1, f"{name}: {found}"
+        return found[0]
 
 
 def base_env() -> dict[str, str]:
@@ -76,8 +88,8 @@ def run_quietly(command: list[str], cwd: Path, env: dict[str, str]) -> None:
     assert done.returncode == 0, f"{command} failed:\n{done.stdout}"
 
 
-def install_with_pip(folder: Path) -> Installation:
-    """Install with pip, not editable, into a venv that borrows the dependencies of this one.
+def make_venv(folder: Path) -> tuple[Path, list[str], dict[str, str]]:
+    """Make a venv that borrows the dependencies of this one; return it, pip there and its env.
 
     A folder named in a .pth file joins sys.path, its own .pth files are not read: neither the
     checkout's editable install nor the ROS bootstrap of the parent comes along. The ROS libraries
@@ -85,18 +97,40 @@ def install_with_pip(folder: Path) -> Installation:
     """
     venv = folder / "venv"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(venv)], check=True)
-    python = str(venv / "bin" / "python")
     site_packages = next(venv.glob("lib/python3*/site-packages"))
     parents = dict.fromkeys([sysconfig.get_path("purelib"), sysconfig.get_path("platlib")])
     parents.update(dict.fromkeys(p for p in sys.path if p.endswith("-packages")))
     (site_packages / "dependencies.pth").write_text("\n".join(parents) + "\n")
-    env = base_env()
-    command = [sys.executable, "-m", "pip", "--python", python, "install", "--quiet"]
-    command += ["--no-deps", "--no-build-isolation", "--no-index", "."]
-    run_quietly(command, copy_source(folder / "source"), env)
-    env |= {"VIRTUAL_ENV": str(venv), "AMENT_PREFIX_PATH": str(venv)}
+    env = base_env() | {"VIRTUAL_ENV": str(venv), "AMENT_PREFIX_PATH": str(venv)}
     env["PATH"] = f"{venv / 'bin'}{os.pathsep}{env['PATH']}"
-    return Installation(venv, python, env)
+    pip = [sys.executable, "-m", "pip", "--python", str(venv / "bin" / "python")]
+    return venv, [*pip, "install", "--quiet", "--no-deps", "--no-index"], env
+
+
+def install_with_pip(folder: Path, *options: str) -> Installation:
+    """Install the sources with pip."""
+    venv, pip, env = make_venv(folder)
+    run_quietly(
+        [*pip, "--no-build-isolation", *options, "."], copy_source(folder / "source"), base_env()
+    )
+    return Installation(venv, str(venv / "bin" / "python"), env)
+
+
+def install_editable(folder: Path) -> Installation:
+    """Install as `make venv` does: the code stays in the source folder."""
+    return install_with_pip(folder, "--editable")
+
+
+def install_wheel(folder: Path) -> Installation:
+    """Build a wheel and install that, as on a machine without the sources."""
+    venv, pip, env = make_venv(folder)
+    source, wheels = copy_source(folder / "source"), folder / "wheels"
+    build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-index"]
+    build += ["--no-build-isolation", "--wheel-dir", str(wheels), "."]
+    run_quietly(build, source, base_env())
+    shutil.rmtree(source)
+    run_quietly([*pip, *map(str, wheels.glob("*.whl"))], folder, base_env())
+    return Installation(venv, str(venv / "bin" / "python"), env)
 
 
 def install_with_colcon(folder: Path) -> Installation:
@@ -113,13 +147,37 @@ def install_with_colcon(folder: Path) -> Installation:
     return Installation(folder / "install" / "tractor_ems", sys.executable, env)
 
 
-@pytest.fixture(scope="session", params=["pip", pytest.param("colcon", marks=pytest.mark.slow)])
+WAYS: dict[str, Callable[[Path], Installation]] = {
+    "pip": install_with_pip,
+    "editable": install_editable,
+    "wheel": install_wheel,
+    "colcon": install_with_colcon,
+}
+COPIES = ["pip", *(pytest.param(way, marks=pytest.mark.slow) for way in ("wheel", "colcon"))]
+
+
+@pytest.fixture(scope="session")
+def install(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Installation]:
+    """Installs outside the checkout in the named way, once per session."""
+    return functools.cache(lambda way: WAYS[way](tmp_path_factory.mktemp(way)))
+
+
+@pytest.fixture(scope="session", params=COPIES)
 def installation(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+    request: pytest.FixtureRequest, install: Callable[[str], Installation]
 ) -> Installation:
-    """A fresh installation outside the checkout."""
-    install = {"pip": install_with_pip, "colcon": install_with_colcon}[request.param]
-    return install(tmp_path_factory.mktemp(request.param))
+    """A fresh installation that is a copy of the package."""
+    return install(request.param)
+
+
+@pytest.fixture(
+    scope="session", params=[*COPIES, pytest.param("editable", marks=pytest.mark.slow)]
+)
+def any_installation(
+    request: pytest.FixtureRequest, install: Callable[[str], Installation]
+) -> Installation:
+    """A fresh installation in any way; an editable one runs the code of its source folder."""
+    return install(request.param)
 
 
 @pytest.fixture

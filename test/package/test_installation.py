@@ -1,5 +1,6 @@
 """After `pip install` and `colcon build` everything is where ROS 2 looks, and starts anywhere."""
 
+import ast
 import filecmp
 import os
 import signal
@@ -14,8 +15,13 @@ import pytest
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
 
 ROOT = Path(__file__).resolve().parents[2]
-NODES = ["plant_sim", "rule_based_policy", "dp_policy", "ddqn_policy", "bag_recorder", "trainer"]
-EXECUTABLES = [*NODES, "ems"]
+EXECUTABLES = next(
+    list(ast.literal_eval(node.value))
+    for node in ast.parse((ROOT / "setup.py").read_text()).body
+    if isinstance(node, ast.Assign) and node.targets[0].id == "EXECUTABLES"
+)
+GIVEN_INPUT = {"bag_player", "trainer"}
+"""Nodes that cannot begin without being told with what."""
 SHIPPED_FOLDERS = {"config": "config", "tractor_sim/data": "data", "bags": "bags"}
 START_LIMIT_S = 90.0
 STOP_LIMIT_S = 30.0
@@ -33,13 +39,13 @@ def shipped_files() -> dict[str, Path]:
     return files
 
 
-def test_ament_index_leads_to_executables(installation, monkeypatch):
-    monkeypatch.setenv("AMENT_PREFIX_PATH", installation.env["AMENT_PREFIX_PATH"])
+def test_ament_index_leads_to_executables(any_installation, monkeypatch):
+    monkeypatch.setenv("AMENT_PREFIX_PATH", any_installation.env["AMENT_PREFIX_PATH"])
     prefix = Path(get_package_prefix("tractor_ems"))
-    assert prefix == installation.prefix
-    assert Path(get_package_share_directory("tractor_ems")) == installation.share
+    assert prefix == any_installation.prefix
+    assert Path(get_package_share_directory("tractor_ems")) == any_installation.share
     for name in EXECUTABLES:
-        assert os.access(prefix / "lib" / "tractor_ems" / name, os.X_OK), name
+        assert any_installation.executable(name) == prefix / "lib" / "tractor_ems" / name
 
 
 def test_this_environment_serves_ros2_run_too(monkeypatch):
@@ -120,15 +126,15 @@ def graph_names(domain_id: int, monkeypatch) -> Iterator:
         rclpy.shutdown(context=context)
 
 
-@pytest.mark.parametrize("name", [n for n in NODES if n != "trainer"])
+@pytest.mark.parametrize("name", sorted({*EXECUTABLES} - GIVEN_INPUT - {"ems"}))
 def test_node_starts_in_an_empty_folder_and_ends_on_sigterm(
-    name, installation, empty_folder, domain_id, monkeypatch
+    name, any_installation, empty_folder, domain_id, monkeypatch
 ):
     log = empty_folder.parent / "output"
     with graph_names(domain_id, monkeypatch) as others, log.open("w") as output:
         process = subprocess.Popen(
-            [installation.executable(name)],
-            cwd=empty_folder, env=node_env(installation, empty_folder, domain_id),
+            [any_installation.executable(name)],
+            cwd=empty_folder, env=node_env(any_installation, empty_folder, domain_id),
             stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
         )  # fmt: skip
         try:
@@ -149,10 +155,13 @@ def test_node_starts_in_an_empty_folder_and_ends_on_sigterm(
     assert "Traceback" not in log.read_text()
 
 
-def test_trainer_without_bags_is_bad_input_in_one_line(installation, empty_folder, domain_id):
+@pytest.mark.parametrize("name", sorted(GIVEN_INPUT & {*EXECUTABLES}))
+def test_node_without_its_input_says_so_in_one_line(
+    name, any_installation, empty_folder, domain_id
+):
     done = subprocess.run(
-        [installation.executable("trainer")],
-        cwd=empty_folder, env=node_env(installation, empty_folder, domain_id), text=True,
+        [any_installation.executable(name)],
+        cwd=empty_folder, env=node_env(any_installation, empty_folder, domain_id), text=True,
         stdin=subprocess.DEVNULL, capture_output=True, timeout=START_LIMIT_S,
     )  # fmt: skip
     assert done.returncode == 2, done.stderr
@@ -161,10 +170,10 @@ def test_trainer_without_bags_is_bad_input_in_one_line(installation, empty_folde
     assert not any(empty_folder.iterdir())
 
 
-def test_command_line_helps_from_an_empty_folder(installation, empty_folder):
+def test_command_line_helps_from_an_empty_folder(any_installation, empty_folder):
     done = subprocess.run(
-        [installation.executable("ems"), "--help"],
-        cwd=empty_folder, env=installation.env, text=True, capture_output=True,
+        [any_installation.executable("ems"), "--help"],
+        cwd=empty_folder, env=any_installation.env, text=True, capture_output=True,
         timeout=START_LIMIT_S,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
