@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal, TypeAlias
 
 from tractor_msgs_py.errors import BagError, ConfigError
@@ -199,6 +200,7 @@ def range_complaint(name: str, value: float) -> str | None:
     return text
 
 
+@lru_cache(maxsize=1024)
 def parse_path(path: str) -> tuple[tuple[str, str], ...]:
     """A field path as (attribute, index) pairs, the index empty where there is none.
 
