@@ -98,7 +98,7 @@ def provenance_of(path: Path) -> dict[str, str]:
     metadata.yaml's custom data for a sqlite3 bag. Empty for a bag of another writer.
     """
     file = storage_file(path)
-    metadata = _metadata(path, file)
+    metadata = metadata_of(path, file)
     try:
         if file.suffix != ".mcap":
             data = metadata.get("custom_data") or {}
@@ -115,10 +115,10 @@ def provenance_of(path: Path) -> dict[str, str]:
         TypeError,
         AttributeError,
     ) as error:
-        raise BagError(f"{path}: provenance cannot be read ({_brief(error)})") from None
+        raise BagError(f"{path}: provenance cannot be read ({brief(error)})") from None
 
 
-def _metadata(path: Path, file: Path) -> dict[str, Any]:
+def metadata_of(path: Path, file: Path) -> dict[str, Any]:
     """metadata.yaml's content, which must be about ``file`` as it is; empty where there is none.
 
     A file that it names instead would be read, and be no part of the bag's hash. What rosbag2
@@ -134,7 +134,7 @@ def _metadata(path: Path, file: Path) -> dict[str, Any]:
         named = [str(name) for name in content["relative_file_paths"]]
         mode = str(content.get("compression_mode") or "").lower()
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise BagError(f"{path}: provenance cannot be read ({_brief(error)})") from None
+        raise BagError(f"{path}: provenance cannot be read ({brief(error)})") from None
     if [Path(name).name for name in named] != [file.name]:
         raise BagError(f"{path}: metadata.yaml names {named}, expected [{file.name!r}]")
     if mode not in ("", "none"):
@@ -179,7 +179,7 @@ def decode(name: str, data: bytes) -> Sample:
 
 def _messages(path: Path, file: Path) -> Iterator[tuple[str, str, bytes]]:
     """Namespace, relative topic name and CDR bytes of the contract's messages."""
-    whole = path if _metadata(path, file) else file
+    whole = path if metadata_of(path, file) else file
     if file.suffix == ".mcap":
         refuse_large_chunks(file)
     try:
@@ -193,7 +193,7 @@ def _messages(path: Path, file: Path) -> Iterator[tuple[str, str, bytes]]:
     except BagError:
         raise
     except Exception as error:  # on foreign bytes the reader raises whatever its parsing meets
-        raise BagError(f"{path}: not a readable bag ({_brief(error)})") from None
+        raise BagError(f"{path}: not a readable bag ({brief(error)})") from None
 
 
 def _contract_connections(path: Path, connections: Sequence[Connection]) -> list[Connection]:
@@ -230,5 +230,5 @@ def _is_bag(path: Path) -> bool:
     return (path.suffix in (".mcap", ".db3") and path.is_file()) or _is_bag_dir(path)
 
 
-def _brief(error: BaseException) -> str:
+def brief(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__

@@ -90,3 +90,17 @@ def values_of(
             continue
         found.append((source, stamp_ns, value))
     return found
+
+
+def reception_ns(run: RunInfo, stamp_ns: int, heard_ns: int, before_ns: int) -> int:
+    """What to give ``ObservationBuilder.sense`` as the time of reception [ns].
+
+    It is when a sample was heard, except in lockstep: there time passes with the stamps, as fast
+    as the answers come.
+
+    Args:
+        run: the present one.
+        stamp_ns, heard_ns: of the sample.
+        before_ns: what this function returned for the sample before, 0 at the start of a run.
+    """
+    return max(stamp_ns, before_ns) if run.lockstep else heard_ns
