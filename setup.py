@@ -22,6 +22,7 @@ EXECUTABLES = {
     "dp_policy": "tractor_ems.executables:dp_policy",
     "ddqn_policy": "tractor_ems.executables:ddqn_policy",
     "bag_recorder": "tractor_ems.executables:bag_recorder",
+    "bag_player": "tractor_ems.executables:bag_player",
     "trainer": "tractor_ems.executables:trainer",
 }
 

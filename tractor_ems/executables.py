@@ -35,6 +35,11 @@ def bag_recorder() -> int:
     return _node("tractor_ems.nodes.bag_recorder")
 
 
+def bag_player() -> int:
+    """The player node."""
+    return _node("tractor_ems.nodes.bag_player")
+
+
 def trainer() -> int:
     """The trainer node."""
     return _node("tractor_ems.nodes.trainer")
