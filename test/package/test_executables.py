@@ -8,7 +8,15 @@ import pytest
 
 from tractor_ems import executables
 
-NODES = ["plant_sim", "rule_based_policy", "dp_policy", "ddqn_policy", "bag_recorder", "trainer"]
+NODES = [
+    "plant_sim",
+    "rule_based_policy",
+    "dp_policy",
+    "ddqn_policy",
+    "bag_recorder",
+    "bag_player",
+    "trainer",
+]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -63,7 +63,7 @@ def test_tests_are_an_extra_and_not_tests_require():
 
 
 def test_executables_are_those_the_documentation_names():
-    nodes = "plant_sim rule_based_policy dp_policy ddqn_policy bag_recorder trainer"
+    nodes = "plant_sim rule_based_policy dp_policy ddqn_policy bag_recorder bag_player trainer"
     assert set(ENTRY_POINTS) == {"ems", *nodes.split()}
 
 
