@@ -129,10 +129,14 @@ def vehicle_fallback(
 
 
 def generator_set_point_w(observation: Observation, command: BatteryPowerCommand) -> float:
-    """P_gen that ``command`` leaves to the generator at this observation's demand, >= 0 [W]: what
-    the next step's ramp starts from."""
+    """P_gen that ``command`` leaves to the generator at this observation's demand, 0..its present
+    limit [W]: what the next step's ramp starts from. NaN where the demand is not finite: nothing
+    is known then, and the ramp starts from what was known before."""
+    if not math.isfinite(observation.power_demand_w[0]):
+        return math.nan
     wished_w = np.array([command.battery_power_w])
-    return float(generator_power_w(observation.power_demand_w[:1], wished_w)[0])
+    set_point_w = generator_power_w(observation.power_demand_w[:1], wished_w)
+    return float(np.fmin(set_point_w, observation.engine_limit_w[:1])[0])
 
 
 def _smaller_w(published_w: FloatArray, own_w: FloatArray) -> FloatArray:
