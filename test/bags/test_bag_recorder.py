@@ -53,7 +53,9 @@ def test_complete_run_is_recorded_and_the_recorder_ends_by_itself(
     assert "output:=rec" in said["recorder_command_line"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM]
+)
 def test_signal_finalises_what_is_there(graph, start_recorder, driven, tmp_path, wait_for, number):
     recorder = start_recorder()
     wait_for(graph.subscribed, "the recorder's subscriptions")
@@ -67,6 +69,7 @@ def test_signal_finalises_what_is_there(graph, start_recorder, driven, tmp_path,
     assert not run.complete and run.gaps == 0 and sum(run.driven) > 10
 
 
+@pytest.mark.slow
 def test_signal_before_anything_came_leaves_nothing(graph, start_recorder, tmp_path, wait_for):
     recorder = start_recorder()
     wait_for(graph.subscribed, "the recorder's subscriptions")
@@ -85,6 +88,7 @@ def test_nothing_for_too_long_is_an_aborted_run(graph, start_recorder, driven, t
     assert not run.complete
 
 
+@pytest.mark.slow
 def test_namespaced_topics_are_recorded_under_their_names(
     make_graph, start_recorder, driven, tmp_path, wait_for
 ):
@@ -97,6 +101,7 @@ def test_namespaced_topics_are_recorded_under_their_names(
     assert run.namespace == "/tractor1" and run.complete
 
 
+@pytest.mark.slow
 def test_two_runs_with_the_same_stamps_go_into_one_bag(
     graph, start_recorder, driven, tmp_path, wait_for
 ):
@@ -119,8 +124,8 @@ def test_two_runs_with_the_same_stamps_go_into_one_bag(
 @pytest.mark.parametrize(
     ("parameters", "output", "message"),
     [
-        (("runs:=-1",), "rec", "parameter runs"),
-        (("ruins:=1",), "rec", "parameter ruins: unknown"),
+        pytest.param(("runs:=-1",), "rec", "parameter runs", marks=pytest.mark.slow),
+        pytest.param(("ruins:=1",), "rec", "parameter ruins: unknown", marks=pytest.mark.slow),
         ((), "there", "exists already"),
     ],
 )
@@ -135,6 +140,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert list((tmp_path / "there").iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_bag_without_a_name_is_named_after_the_time(start_recorder, tmp_path):
     recorder = start_recorder(output=None)
     deadline_s = time.monotonic() + 60.0

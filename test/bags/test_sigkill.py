@@ -92,7 +92,7 @@ def kill_repeatedly(make_graph, start_recorder, driven, tmp_path, wait_for, time
 def test_killed_recorder_loses_no_flushed_message(
     make_graph, start_recorder, driven, tmp_path, wait_for
 ):
-    kill_repeatedly(make_graph, start_recorder, driven, tmp_path, wait_for, 2)
+    kill_repeatedly(make_graph, start_recorder, driven, tmp_path, wait_for, 1)
 
 
 @pytest.mark.slow

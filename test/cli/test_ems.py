@@ -45,7 +45,15 @@ def refusal(capsys, *argv):
 
 
 @pytest.mark.parametrize(
-    "policy", ["conventional", "rule_based", "best_point", "myopic_greedy", "dp"]
+    "policy",
+    [
+        "rule_based",
+        "dp",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("conventional", "best_point", "myopic_greedy")
+        ),
+    ],
 )
 def test_evaluate_prints_one_bare_result(capsys, policy):
     result = document(capsys, "evaluate", "--policy", policy, "--cycle", "planter_1001")

@@ -13,7 +13,8 @@ from tractor_ems.scenario import make_scenario
 from tractor_msgs_py.trajectory import trajectory_hash
 
 
-@pytest.mark.parametrize("name", [pytest.param("rule_based", marks=pytest.mark.slow), "default"])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["rule_based", "default"])
 def test_ros_in_process_and_replay_are_one_trajectory_twice_in_a_row(name, tmp_path):
     scenario = make_scenario("paper", "planter", 0.85, 0.836)
     policy = make_policy(name, scenario)

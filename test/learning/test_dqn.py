@@ -166,7 +166,9 @@ def test_torch_numpy_and_compiled_nets_start_alike(activation):
         assert np.abs(q - torch_q).max() < 1e-6
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e38])
+@pytest.mark.parametrize(
+    "value", [np.nan, *(pytest.param(v, marks=pytest.mark.slow) for v in (np.inf, 1e38))]
+)
 def test_a_diverged_run_is_aborted_and_leaves_nothing(
     value: float, paper, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -206,6 +208,7 @@ for preset in ("sampled", "counterfactual"):
 """
 
 
+@pytest.mark.slow
 def test_torch_is_needed_for_counterfactual_targets_alone(tmp_path: Path):
     done = subprocess.run(
         [sys.executable, "-c", NO_TORCH, str(tmp_path)],

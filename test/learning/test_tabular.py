@@ -33,6 +33,7 @@ PAPER = load_powertrain("paper")
 DEMAND_W = load_cycle("planter").power_demand_w[:120]
 GAMMA = 0.9
 
+SLOW = pytest.mark.slow
 DOUBLE = pytest.mark.parametrize("double", [False, True], ids=["q", "double_q"])
 INTERPOLATE = pytest.mark.parametrize("interpolate", [False, True], ids=["binned", "interpolated"])
 
@@ -92,7 +93,7 @@ def test_soc_leaves_its_bin_although_no_step_moves_it_by_a_tenth_of_one():
 
 @DOUBLE
 @INTERPOLATE
-@pytest.mark.parametrize("soc", [0.7005, 0.85, 0.8995])
+@pytest.mark.parametrize("soc", [0.7005, *(pytest.param(x, marks=SLOW) for x in (0.85, 0.8995))])
 def test_infeasible_actions_are_never_visited(double: bool, interpolate: bool, soc: float):
     """At both ends of the SOC window, and between. Allowed is what any state within reach of the
     bin allows, by brute force over SOC and the demands of the cycle."""

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -104,6 +105,7 @@ def test_trainer_tells_its_progress_and_exits_0_when_done(
     assert "Traceback" not in log.read_text()
 
 
+@pytest.mark.slow
 def test_sigterm_leaves_a_checkpoint_and_exits_0(
     bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -147,14 +149,19 @@ def test_sigterm_exits_2_where_the_checkpoint_cannot_be_written(
     assert "Traceback" not in log.read_text()
 
 
+slow = partial(pytest.param, marks=pytest.mark.slow)
+
+
 @pytest.mark.parametrize(
     ("parameters", "named"),
     [
         ({"bags": "['/no/such/bag']", "output": "p.safetensors"}, "/no/such/bag"),
-        ({"bags": "/no/such/bag", "output": "p.safetensors"}, "/no/such/bag"),
-        ({"bags": "7", "output": "p.safetensors"}, "parameter bags"),
-        ({"bags": "['x']"}, "parameter output"),
-        ({"bags": "['x']", "output": "p.safetensors", "targets": "guess"}, "parameter targets"),
+        slow({"bags": "/no/such/bag", "output": "p.safetensors"}, "/no/such/bag"),
+        slow({"bags": "7", "output": "p.safetensors"}, "parameter bags"),
+        slow({"bags": "['x']"}, "parameter output"),
+        slow(
+            {"bags": "['x']", "output": "p.safetensors", "targets": "guess"}, "parameter targets"
+        ),
     ],
 )
 def test_bad_input_exits_2_with_one_line(

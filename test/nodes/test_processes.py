@@ -38,9 +38,8 @@ def planter_hash(policy) -> str:
     return trajectory_hash(trajectory)
 
 
-@pytest.mark.parametrize(
-    "executable", [pytest.param("rule_based_policy", marks=pytest.mark.slow), "ddqn_policy"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("executable", ["rule_based_policy", "ddqn_policy"])
 def test_plant_and_policy_started_by_hand_in_either_order_drive_the_planter(start, executable):
     expected = planter_hash(default_policy(executable))[:16]
     node = start(executable)
@@ -72,6 +71,7 @@ def test_a_policy_killed_mid_run_ends_the_run_with_a_named_reason(
     assert not any((tmp_path / "run").iterdir())
 
 
+@pytest.mark.slow
 def test_a_second_policy_ends_the_run_and_both_policies_say_so(start, make_cycle, wait_for):
     policies = [start("rule_based_policy"), start("rule_based_policy", policy="conventional")]
     for policy in policies:
@@ -111,9 +111,8 @@ def end_every_node(number, start, graph, policy_file) -> None:
     graph.remove(observer)
 
 
-@pytest.mark.parametrize(
-    "number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_every_node_ends_with_code_0_on_a_signal(start, graph, untrained, number):
     policy_file, _ = untrained()
     end_every_node(number, start, graph, policy_file)

@@ -132,7 +132,9 @@ def test_nothing_beats_dp_in_many_more_runs(plant, policy, where, seed):
     check_that_nothing_beats_dp(plant, policy, where, seed)
 
 
-@pytest.mark.parametrize("policy", [2, 4, 7, 8])
+@pytest.mark.parametrize(
+    "policy", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (4, 7, 8))]
+)
 def test_nothing_beats_dp_on_the_paper_cycle(policy):
     """Conventional and best point have tests of their own below."""
     made = policies(PAPER, np.random.default_rng(5))[policy]

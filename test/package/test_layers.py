@@ -17,6 +17,7 @@ ROS = [
     "sensor_msgs",
     "std_msgs",
     "diagnostic_msgs",
+    "std_srvs",
     "builtin_interfaces",
     "rosidl_runtime_py",
 ]
@@ -75,6 +76,7 @@ def imported_names(path: Path) -> Iterator[str]:
             yield ".".join([*base, *([node.module] if node.module else [])])
 
 
+@pytest.mark.slow
 def test_core_imports_with_ros_blocked():
     modules = core_modules()
     assert {"tractor_msgs_py", "tractor_sim.resources", "tractor_ems"} <= set(modules)

@@ -79,7 +79,9 @@ def test_names_are_unique_and_every_reward_curve_is_a_figure_of_its_own():
 
 
 @pytest.mark.parametrize("spec", FIGURES, ids=lambda spec: spec.name)
-@pytest.mark.parametrize("make", [full, single_seed, with_gaps, nothing])
+@pytest.mark.parametrize(
+    "make", [full, pytest.param(single_seed, marks=pytest.mark.slow), with_gaps, nothing]
+)
 def test_every_figure_is_built_and_its_axes_carry_units(spec: FigureSpec, make):
     figure = spec.build(make())
     labels = [label for axes in figure.axes for label in numeric_labels(axes)]
@@ -89,7 +91,16 @@ def test_every_figure_is_built_and_its_axes_carry_units(spec: FigureSpec, make):
     assert "nan" not in texts(figure).lower()
 
 
-@pytest.mark.parametrize("name", ["powertrain", "state_visits", "pearson", "reward_ddqn"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "reward_ddqn",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("powertrain", "state_visits", "pearson")
+        ),
+    ],
+)
 def test_equal_results_give_equal_bytes(tmp_path: Path, name: str):
     for turn in ("a", "b"):
         figure = BY_NAME[name].build(full())
