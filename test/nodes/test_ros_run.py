@@ -117,7 +117,7 @@ def test_an_existing_bag_is_refused_and_kept(scenario, tmp_path):
     assert (tmp_path / "bag").is_dir()
 
 
-@pytest.mark.parametrize("otherwise", ["fails", "succeeds"])
+@pytest.mark.parametrize("otherwise", ["fails", pytest.param("succeeds", marks=pytest.mark.slow)])
 def test_a_bag_that_somebody_else_makes_meanwhile_is_kept(
     scenario, monkeypatch, tmp_path, otherwise
 ):

@@ -126,7 +126,13 @@ def graph_names(domain_id: int, monkeypatch) -> Iterator:
         rclpy.shutdown(context=context)
 
 
-@pytest.mark.parametrize("name", sorted({*EXECUTABLES} - GIVEN_INPUT - {"ems"}))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name != "plant_sim"))
+        for name in sorted({*EXECUTABLES} - GIVEN_INPUT - {"ems"})
+    ],
+)
 def test_node_starts_in_an_empty_folder_and_ends_on_sigterm(
     name, any_installation, empty_folder, domain_id, monkeypatch
 ):

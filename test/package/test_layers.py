@@ -4,6 +4,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -63,8 +64,13 @@ def import_with(blocked: list[str], modules: list[str]) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def imported_names(path: Path) -> Iterator[str]:
-    """Yield the dotted name of every import in a file, wherever it stands."""
+@cache
+def imported_names(path: Path) -> tuple[str, ...]:
+    """The dotted name of every import in a file, wherever it stands."""
+    return tuple(names_imported_by(path))
+
+
+def names_imported_by(path: Path) -> Iterator[str]:
     package = module_name(path).split(".")
     if path.name != "__init__.py":
         package.pop()
