@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-from tractor_ems.nodes import ddqn_policy, dp_policy, rule_based_policy
+from tractor_ems.nodes import bag_player, ddqn_policy, dp_policy, rule_based_policy
 from tractor_ems.nodes.policy_node import COMMON
 from tractor_msgs_py.ros.shell import run_node
 from tractor_sim.nodes import plant_parameters, plant_sim
@@ -13,6 +13,7 @@ NODES = {
     "plant_sim": (plant_sim.main, plant_parameters.PARAMETERS),
     "rule_based_policy": (rule_based_policy.main, (*rule_based_policy.PARAMETERS, *COMMON)),
     "dp_policy": (dp_policy.main, (*dp_policy.PARAMETERS, *COMMON)),
+    "bag_player": (bag_player.main, bag_player.PARAMETERS),
     "ddqn_policy": (ddqn_policy.main, (*ddqn_policy.PARAMETERS, *COMMON)),
 }
 
@@ -52,6 +53,12 @@ def run(domain_id, monkeypatch, capfd):
         ("rule_based_policy", "threshold_w:=-1.0", "range 0..1e+09"),
         ("rule_based_policy", "soc_guard:=1", "parameter soc_guard: 1 is not a valid bool"),
         ("plant_sim", "output:=/dev/null/run", "/dev/null/run: no place for a result"),
+        ("plant_sim", "demand:=topics", "one of cycle, topic"),
+        ("bag_player", "what:=topics", "parameter bag: '', expected a bag to play"),
+        ("bag_player", "bag:=none", "none: no such bag"),
+        ("bag_player", "rate:=0.0", "range 0.001..1000"),
+        ("bag_player", "pace:=fast", "one of auto, lockstep, real_time"),
+        ("bag_player", "loop:=true", "parameter loop: unknown"),
         ("dp_policy", "actions:=100000", "range 2..20000"),
         ("dp_policy", "soc_points:=1", "range 4..5000"),
         ("dp_policy", "cycle:=planter_0x", "cycle 'planter_0x': unknown"),

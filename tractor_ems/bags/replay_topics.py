@@ -13,6 +13,7 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 
 from tractor_ems.bags.chunk_limit import refuse_large_chunks
+from tractor_ems.bags.plain_yaml import parse_yaml
 from tractor_ems.bags.read import storage_file
 from tractor_msgs_py.errors import BagError, ConfigError
 from tractor_msgs_py.topics import Qos
@@ -144,11 +145,9 @@ def _opened(path: Path) -> Iterator[Reader]:
         for file in files:
             if file.suffix == ".mcap":
                 refuse_large_chunks(file)
-        unopened = Reader(whole)
-        if unopened.compression_mode:
-            mode = unopened.compression_mode
-            raise BagError(f"{path}: compression_mode {mode!r}, allowed none (chunks may be)")
-        with unopened as reader:
+        if described:
+            _refuse_compressed(path)
+        with Reader(whole) as reader:
             if not reader.message_count:
                 raise BagError(f"{path}: is empty")
             yield reader
@@ -156,6 +155,15 @@ def _opened(path: Path) -> Iterator[Reader]:
         raise
     except Exception as error:  # on foreign bytes the reader raises whatever its parsing meets
         raise BagError(f"{path}: not a readable bag ({' '.join(str(error).split())})") from None
+
+
+def _refuse_compressed(path: Path) -> None:
+    """What rosbag2 compressed on top of its storage has no limit to what it expands to."""
+    text = (path / "metadata.yaml").read_text(encoding="utf-8")
+    content = parse_yaml(text, f"{path}: metadata.yaml cannot be read")
+    mode = str(content["rosbag2_bagfile_information"].get("compression_mode") or "").lower()
+    if mode not in ("", "none"):
+        raise BagError(f"{path}: compression_mode {mode!r}, allowed none (chunks may be)")
 
 
 def _full(name: str) -> str:
