@@ -1,6 +1,7 @@
 """The DP policy acts on the actual state, and drives nothing but the cycle it was solved for."""
 
 import dataclasses
+from functools import cache
 
 import numpy as np
 import pytest
@@ -19,9 +20,14 @@ from tractor_sim.readings import battery_reading, powertrain_reading
 
 PAPER = load_powertrain("paper")
 DEMAND_W = load_cycle("planter").power_demand_w[:150]
-POLICY = solve_policy(PAPER, DEMAND_W, 0.85, 0.845)
 SOC_TOLERANCE = 1e-9
 """How exactly an in-process run ends at a target that it can reach."""
+
+
+@cache
+def solved() -> DpPolicy:
+    """The policy of most tests, solved by the first."""
+    return solve_policy(PAPER, DEMAND_W, 0.85, 0.845)
 
 
 def run_info(t0_ns: int = DEFAULT_T0_NS) -> RunInfo:
@@ -58,7 +64,7 @@ def observe(
 
 
 def first_observation(k: int = 0, demand_w: float = DEMAND_W[0], soc: float = 0.85) -> Observation:
-    builder = ObservationBuilder(POLICY.spec)
+    builder = ObservationBuilder(solved().spec)
     builder.start_run(run_info())
     return observe(builder, k, demand_w, initial_state(PAPER, soc))
 
@@ -72,13 +78,13 @@ def test_run_ends_at_the_target(soc_target):
 
 
 def test_one_observation_at_a_time_gives_the_commands_of_the_in_process_run():
-    run = drive(POLICY, PAPER, DEMAND_W[None, :], 0.85, 0.845)[0]
-    builder = ObservationBuilder(POLICY.spec)
+    run = drive(solved(), PAPER, DEMAND_W[None, :], 0.85, 0.845)[0]
+    builder = ObservationBuilder(solved().spec)
     builder.start_run(run_info())
-    state, last, memory = initial_state(PAPER, 0.85), None, POLICY.init(1)
+    state, last, memory = initial_state(PAPER, 0.85), None, solved().init(1)
     for k, demand_w in enumerate(DEMAND_W):
         observation = observe(builder, k, float(demand_w), state, last)
-        command, memory = POLICY.act(observation, memory)
+        command, memory = solved().act(observation, memory)
         assert command.battery_power_w[0] == run.command_battery_power_w[k]
         np.testing.assert_array_equal(command.engine_power_w[0], run.command_engine_power_w[k])
         state, last = step(PAPER, state, observation.power_demand_w, command)
@@ -86,13 +92,13 @@ def test_one_observation_at_a_time_gives_the_commands_of_the_in_process_run():
 
 def test_a_batch_drives_like_single_runs():
     demand_w = np.tile(DEMAND_W, (3, 1))
-    alone = drive(POLICY, PAPER, demand_w[:1], 0.85, 0.845)[0]
-    hashes = {trajectory_hash(run) for run in drive(POLICY, PAPER, demand_w, 0.85, 0.845)}
+    alone = drive(solved(), PAPER, demand_w[:1], 0.85, 0.845)[0]
+    hashes = {trajectory_hash(run) for run in drive(solved(), PAPER, demand_w, 0.85, 0.845)}
     assert hashes == {trajectory_hash(alone)}
 
 
 def test_engine_off_is_said_and_never_inferred():
-    run = drive(POLICY, PAPER, DEMAND_W[None, :], 0.85, 0.845)[0]
+    run = drive(solved(), PAPER, DEMAND_W[None, :], 0.85, 0.845)[0]
     said_off = run.command_engine_power_w == 0.0
     assert said_off.any()
     assert not said_off.all()
@@ -103,12 +109,12 @@ def test_engine_off_is_said_and_never_inferred():
 
 def test_a_disturbed_soc_is_acted_on_and_the_target_still_met():
     """The policy goes by the state it sees: half a step of energy vanishes, and is replaced."""
-    state, memory = initial_state(PAPER, 0.85), POLICY.init(1)
-    builder = ObservationBuilder(POLICY.spec)
+    state, memory = initial_state(PAPER, 0.85), solved().init(1)
+    builder = ObservationBuilder(solved().spec)
     builder.start_run(run_info())
     for k, demand_w in enumerate(DEMAND_W):
         observation = observe(builder, k, float(demand_w), state)
-        command, memory = POLICY.act(observation, memory)
+        command, memory = solved().act(observation, memory)
         state, _ = step(PAPER, state, observation.power_demand_w, command)
         if k == 60:
             state = dataclasses.replace(state, soc=state.soc - 1e-4)
@@ -117,9 +123,9 @@ def test_a_disturbed_soc_is_acted_on_and_the_target_still_met():
 
 
 def test_state_is_not_mutated_and_decides_the_same_again():
-    observation, memory = first_observation(), POLICY.init(1)
-    first, after = POLICY.act(observation, memory)
-    second, _ = POLICY.act(observation, memory)
+    observation, memory = first_observation(), solved().init(1)
+    first, after = solved().act(observation, memory)
+    second, _ = solved().act(observation, memory)
     assert memory.t0_ns is None
     assert after.t0_ns == observation.stamp_ns
     assert first.battery_power_w[0] == second.battery_power_w[0]
@@ -129,7 +135,7 @@ def test_another_demand_stops_the_run_with_tick_and_both_demands():
     demand_w = DEMAND_W.copy()
     demand_w[7] += 1.0
     with pytest.raises(RunAborted) as error:
-        drive(POLICY, PAPER, demand_w[None, :], 0.85, 0.845)
+        drive(solved(), PAPER, demand_w[None, :], 0.85, 0.845)
     message = str(error.value)
     assert "tick 7" in message
     assert f"{demand_w[7]}" in message
@@ -141,28 +147,28 @@ def test_another_demand_stops_the_run_with_tick_and_both_demands():
 def test_a_demand_that_is_no_number_is_not_the_solved_one(demand_w):
     observation = dataclasses.replace(first_observation(), power_demand_w=np.array([demand_w]))
     with pytest.raises(RunAborted, match="tick 0"):
-        POLICY.act(observation, POLICY.init(1))
+        solved().act(observation, solved().init(1))
 
 
 def test_a_longer_cycle_stops_at_the_end_of_the_solved_one():
     longer_w = np.append(DEMAND_W, DEMAND_W[-1])
     with pytest.raises(RunAborted, match=r"tick 150 .* ticks 0..149"):
-        drive(POLICY, PAPER, longer_w[None, :], 0.85, 0.845)
+        drive(solved(), PAPER, longer_w[None, :], 0.85, 0.845)
 
 
 def test_a_known_epoch_places_a_policy_that_joins_late():
-    policy = dataclasses.replace(POLICY, t0_ns=DEFAULT_T0_NS)
-    run = drive(POLICY, PAPER, DEMAND_W[None, :], 0.85, 0.845)[0]
+    policy = dataclasses.replace(solved(), t0_ns=DEFAULT_T0_NS)
+    run = drive(solved(), PAPER, DEMAND_W[None, :], 0.85, 0.845)[0]
     observation = first_observation(40, DEMAND_W[40], float(run.soc[40]))
     command, _ = policy.act(observation, policy.init(1))
     assert command.battery_power_w[0] == pytest.approx(run.command_battery_power_w[40], abs=50.0)
     with pytest.raises(RunAborted, match="tick 0"):
-        POLICY.act(observation, POLICY.init(1))
+        solved().act(observation, solved().init(1))
 
 
 def test_another_initial_soc_is_refused():
     with pytest.raises(RunAborted, match=r"tick 0: SOC is 0.8.* from 0.85 to 0.845"):
-        drive(POLICY, PAPER, DEMAND_W[None, :], 0.80, 0.845)
+        drive(solved(), PAPER, DEMAND_W[None, :], 0.80, 0.845)
 
 
 def test_a_solution_for_the_whole_window_starts_anywhere():
@@ -175,4 +181,4 @@ def test_a_solution_for_the_whole_window_starts_anywhere():
 def test_a_solution_of_another_powertrain_is_refused():
     other = dataclasses.replace(PAPER, p_aux_w=4e3)
     with pytest.raises(PolicyError, match="cannot drive paper"):
-        DpPolicy(other, POLICY.solution)
+        DpPolicy(other, solved().solution)
