@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeAlias
 
-from tractor_ems.decide import DecideConfig, Decider, Decision
+from tractor_ems.decide import NOT_KNOWN, Applied, DecideConfig, Decider, Decision
 from tractor_ems.policies.protocol import Policy
 from tractor_msgs_py.errors import PolicyError
 from tractor_msgs_py.observation import ObservationBuilder
@@ -83,6 +83,7 @@ class Answerer:
     def _forget(self) -> None:
         self.decision: Decision | None = None
         self._answer: BatteryPowerCommand | None = None
+        self._reading: PowertrainReading | None = None
         self._connected = False
         self._over = False
 
@@ -163,16 +164,27 @@ class Answerer:
         if self._answer is not None and sample.stamp_ns == self._answer.stamp_ns:
             repeated = isinstance(sample, PowerDemand)  # one answer per resent tick
             return self._if_connected(command_subscribers) if repeated else None
+        if isinstance(sample, PowertrainReading):
+            self._reading = sample
         observation = self._builder.add(sample)
         if observation is None or run is None:
             return None
         self._over, self._answer = False, None
         heard = self.decider.handover.commanding and command_subscribers() > 0
-        decision = self.decider.decide(observation, now_s, heard=heard)
+        applied = self._applied(observation.stamp_ns)
+        decision = self.decider.decide(observation, now_s, heard=heard, applied=applied)
         if decision is None:
             return None
         self.decision, self._answer = decision, decision.command
         return self._if_connected(command_subscribers)
+
+    def _applied(self, stamp_ns: int) -> Applied:
+        reading = self._reading
+        if reading is None or reading.stamp_ns != stamp_ns:
+            return NOT_KNOWN
+        return Applied(
+            reading.applied_battery_power_w, reading.applied_engine_power_w, reading.fuel_kg
+        )
 
     def overdue(self, now_s: float) -> BatteryPowerCommand | None:
         """The fallback command when a real-time run has gone silent: at once when its time is

@@ -4,12 +4,13 @@ A pure state machine like its sibling ``answer``, around the same ``Decider``. W
 a run is made up once the signals have been heard for a while.
 """
 
+import math
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from tractor_ems.answer import RunCheck, check_powertrain
-from tractor_ems.decide import DecideConfig, Decider, Decision
+from tractor_ems.decide import Applied, DecideConfig, Decider, Decision
 from tractor_ems.policies.protocol import Policy
 from tractor_ems.signals.vehicle import sampling_of, vehicle_run
 from tractor_msgs_py.errors import PolicyError
@@ -19,7 +20,7 @@ from tractor_msgs_py.observation import (
     ObservationSpec,
     SampledTick,
 )
-from tractor_msgs_py.signals import OBSERVED, SignalMap, Source
+from tractor_msgs_py.signals import ENGINE_ON_W, OBSERVED, SignalMap, Source
 from tractor_msgs_py.types import BatteryPowerCommand, Reason, RunInfo
 
 RUN_INFO_S = 1.0
@@ -264,8 +265,14 @@ class SampledAnswerer:
             self._blind(received_ns * 1e-9)
             return None
         fresh, self._used_ns = self._heard_ns > self._used_ns, self._heard_ns
+        engine_w = float(tick.observation.engine_power_w[0])
+        applied = Applied(
+            frame.values.get("battery_power_w", math.nan),
+            engine_w if engine_w > ENGINE_ON_W or tick.observation.engine_on[0] else 0.0,
+            frame.values.get("fuel_kg_per_s", math.nan) * self.dt_s,
+        )
         decision = self.decider.decide(
-            tick.observation, self._heard_ns * 1e-9, heard=heard, fresh=fresh
+            tick.observation, self._heard_ns * 1e-9, heard=heard, fresh=fresh, applied=applied
         )
         if decision is not None:
             self.decision = decision

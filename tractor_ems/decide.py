@@ -4,6 +4,7 @@
 an observation; what follows is the same for both and is in here.
 """
 
+import math
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -52,6 +53,23 @@ class DecideConfig:
 
 
 @dataclass(frozen=True)
+class Applied:
+    """What was applied over the step that an observation ends; NaN where no signal says.
+
+    Attributes:
+        battery_power_w, engine_power_w: at the bus [W].
+        fuel_kg: measured [kg].
+    """
+
+    battery_power_w: float = math.nan
+    engine_power_w: float = math.nan
+    fuel_kg: float = math.nan
+
+
+NOT_KNOWN = Applied()
+
+
+@dataclass(frozen=True)
 class Decision:
     """What came of one observation.
 
@@ -59,11 +77,13 @@ class Decision:
         observation: what was decided on.
         wish: the policy's own command made safe, or the fallback law.
         command: what to publish; None: nothing.
+        applied: over the step before, by whomever.
     """
 
     observation: Observation
     wish: BatteryPowerCommand
     command: BatteryPowerCommand | None
+    applied: Applied = NOT_KNOWN
 
 
 class Decider:
@@ -126,7 +146,13 @@ class Decider:
         )
 
     def decide(
-        self, observation: Observation, now_s: float, *, heard: bool = True, fresh: bool = True
+        self,
+        observation: Observation,
+        now_s: float,
+        *,
+        heard: bool = True,
+        fresh: bool = True,
+        applied: Applied = NOT_KNOWN,
     ) -> Decision | None:
         """The next observation; None where it must not be used.
 
@@ -135,11 +161,12 @@ class Decider:
             now_s: when its newest sample was heard, by a steady clock [s].
             heard: somebody listens to the command topic.
             fresh: something was heard since the last tick; else it is no proof of life.
+            applied: over the step that the observation ends.
 
         Raises whatever the policy raises in a lockstep run.
         """
         if not self._supervised:
-            return self._unsupervised(observation)
+            return self._unsupervised(observation, applied)
         if not self._believe(observation, now_s, fresh):
             return None
         params, command, corrected = self.config.params, None, False
@@ -167,17 +194,17 @@ class Decider:
             self._said(now_s)
             if self.mode is Mode.SHADOW:
                 self.clear()
-        return Decision(observation, wish, sent)
+        return Decision(observation, wish, sent, applied)
 
     def _said(self, now_s: float) -> None:
         self._said_s, self._said_in = now_s, self.trust.condition
 
-    def _unsupervised(self, observation: Observation) -> Decision:
+    def _unsupervised(self, observation: Observation, applied: Applied) -> Decision:
         self._observation = observation
         command, self._memory = self.policy.act(observation, self._memory)
         wish, corrected = safe_command(observation, command)
         self.corrected += corrected
-        return Decision(observation, wish, wish if self.handover.commanding else None)
+        return Decision(observation, wish, wish if self.handover.commanding else None, applied)
 
     def _believe(self, observation: Observation, now_s: float, fresh: bool) -> bool:
         if self._plausible is not None:

@@ -25,7 +25,7 @@ def prepare(values: Mapping[str, Any]) -> PolicySetup:
     named = values["policy_file"]
     path = Path(named) if named else resource_path("data", "policy", "paper.safetensors")
     policy = load_policy(path)
-    return PolicySetup(policy, powertrain_hash(policy.params))
+    return PolicySetup(policy, powertrain_hash(policy.params), params=policy.params)
 
 
 def main() -> int:

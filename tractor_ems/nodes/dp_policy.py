@@ -44,7 +44,7 @@ def prepare(values: Mapping[str, Any]) -> PolicySetup:
     if has_engine_state(params):
         plan = solve_engine(params, run.power_demand_w, info.soc_initial, info.soc_target)
         planned = dataclasses.replace(plan_policy(params, plan), t0_ns=info.t0_ns)
-        return PolicySetup(planned, info.powertrain_hash, only(info))
+        return PolicySetup(planned, info.powertrain_hash, only(info), params)
     solution = solve(
         params,
         run.power_demand_w,
@@ -54,7 +54,7 @@ def prepare(values: Mapping[str, Any]) -> PolicySetup:
         actions=values["actions"],
     )
     policy = DpPolicy(params, solution, t0_ns=info.t0_ns)
-    return PolicySetup(policy, info.powertrain_hash, only(info))
+    return PolicySetup(policy, info.powertrain_hash, only(info), params)
 
 
 def only(solved: RunInfo) -> Callable[[RunInfo], None]:

@@ -45,7 +45,7 @@ def prepare(values: Mapping[str, Any]) -> PolicySetup:
         )
     else:
         policy = make_rule(values["policy"], params)
-    return PolicySetup(policy, powertrain_hash(params))
+    return PolicySetup(policy, powertrain_hash(params), params=params)
 
 
 def main() -> int:

@@ -5,15 +5,21 @@ signal handlers are ours, a SingleThreadedExecutor spins in a bounded loop, and 
 is sent while the context is still valid.
 """
 
+import math
 import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import FrameType
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import rclpy
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
 from rclpy.exceptions import (
     InvalidParameterTypeException,
@@ -38,7 +44,8 @@ class Parameter:
     """One declared parameter; its description ends with unit and range.
 
     ``minimum``/``maximum`` apply to numbers (NaN and inf are refused by the range), ``choices``
-    to strings. Every parameter is read once at start, so it is read-only.
+    to strings. A parameter is read once at start, so it is read-only, unless it is ``dynamic``:
+    then the node's logic is told of every change by ``on_parameters``.
     """
 
     name: str
@@ -48,6 +55,7 @@ class Parameter:
     minimum: float | None = None
     maximum: float | None = None
     choices: tuple[str, ...] = ()
+    dynamic: bool = False
 
     @property
     def text(self) -> str:
@@ -59,6 +67,8 @@ class Parameter:
             parts.append(f"range {self.minimum:g}..{self.maximum:g}")
         if self.choices:
             parts.append("one of " + ", ".join(self.choices))
+        if self.dynamic:
+            parts.append("(can be set while running)")
         return " ".join(parts)
 
 
@@ -70,6 +80,14 @@ class Logic(Protocol):
 
     def shutdown(self) -> None:
         """Send the safe command, close files. The context is still valid; called exactly once."""
+
+
+@runtime_checkable
+class Tunable(Logic, Protocol):
+    """Logic of a node with dynamic parameters."""
+
+    def on_parameters(self, values: Mapping[str, Any]) -> None:
+        """Valid new values of dynamic parameters, by name; called after they were set."""
 
 
 def qos_profile(qos: Qos) -> QoSProfile:
@@ -100,7 +118,9 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Any]:
     given = _overrides(node)
     values = {}
     for parameter in parameters:
-        descriptor = ParameterDescriptor(description=parameter.text, read_only=True)
+        descriptor = ParameterDescriptor(
+            description=parameter.text, read_only=not parameter.dynamic
+        )
         # One path is not a list to ROS; whoever gives one means a list of one.
         descriptor.dynamic_typing = isinstance(parameter.default, list)
         if parameter.minimum is not None and parameter.maximum is not None:
@@ -142,6 +162,31 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Any]:
                 f"parameter {name}: unknown, declared are {', '.join(sorted(known))}"
             )
     return values
+
+
+def accept_changes(node: Node, parameters: Sequence[Parameter], logic: Tunable) -> None:
+    """Tell ``logic`` of every valid change of a dynamic parameter; the others are refused, with
+    the reason, before anything is set."""
+    dynamic = {parameter.name: parameter for parameter in parameters if parameter.dynamic}
+
+    def validate(changes: list[Any]) -> SetParametersResult:
+        for change in changes:
+            parameter = dynamic.get(change.name)
+            if parameter is None:
+                continue  # rclpy refuses what is read-only
+            wrong = isinstance(change.value, float) and not math.isfinite(change.value)
+            if wrong or (parameter.choices and change.value not in parameter.choices):
+                reason = f"parameter {change.name}: {change.value!r}; {parameter.text}"
+                return SetParametersResult(successful=False, reason=reason)
+        return SetParametersResult(successful=True)
+
+    def commit(changes: list[Any]) -> None:
+        values = {change.name: change.value for change in changes if change.name in dynamic}
+        if values:
+            logic.on_parameters(values)
+
+    node.add_on_set_parameters_callback(validate)
+    node.add_post_set_parameters_callback(commit)
 
 
 def run_node(
@@ -188,6 +233,8 @@ def run_node(
     try:
         node = Node(name)
         logic = build(node, declare(node, parameters))
+        if isinstance(logic, Tunable):
+            accept_changes(node, parameters, logic)
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         code = logic.finished()

@@ -1,0 +1,125 @@
+"""What a policy's node tells people: diagnostics, a line at the end, a JSON file. Pure."""
+
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+from tractor_ems.decide import Decider, Decision
+from tractor_ems.latency import Latencies
+from tractor_ems.policies.protocol import Policy
+from tractor_ems.shadow_log import ShadowLog
+from tractor_msgs_py import supervisor
+from tractor_msgs_py.atomic import write_json
+from tractor_msgs_py.supervisor import Condition
+from tractor_msgs_py.types import BatteryPowerCommand, RunInfo
+
+
+class Answers(Protocol):
+    """What ``Answerer`` and ``SampledAnswerer`` have in common."""
+
+    @property
+    def policy(self) -> Policy: ...
+
+    @property
+    def decider(self) -> Decider: ...
+
+    @property
+    def decision(self) -> Decision | None: ...
+
+    @property
+    def run(self) -> RunInfo | None: ...
+
+    @property
+    def refusals(self) -> Counter[str]: ...
+
+    @property
+    def counters(self) -> dict[str, int]: ...
+
+    @property
+    def active(self) -> bool: ...
+
+    def start_run(self, run: RunInfo) -> None: ...
+
+    def aim(self, soc_target: float | None) -> None: ...
+
+    def overdue(self, now_s: float) -> BatteryPowerCommand | None: ...
+
+    def shutdown_command(self) -> BatteryPowerCommand | None: ...
+
+
+def state_of(answers: Answers) -> str:
+    """Where it is, in a few words."""
+    decider = answers.decider
+    if not answers.active and decider.trust.condition is Condition.INIT:
+        return "waiting for a run" if answers.run is None else "waiting for observations"
+    mode, trust = decider.mode.name.lower(), decider.trust
+    driving = "driving" if decider.handover.commanding else "following"
+    if trust.condition in (Condition.INIT, Condition.NOMINAL):
+        return driving if mode in ("engaged", "shadow") else f"{driving}, {mode}"
+    return supervisor.describe(trust)
+
+
+def values_of(
+    answers: Answers,
+    latencies: Latencies,
+    mismatches: Mapping[str, str],
+    log: ShadowLog | None,
+    others: int,
+) -> dict[str, object]:
+    """Everything people may want to see, flat."""
+    decider = answers.decider
+    missing: Mapping[str, str] = getattr(answers, "missing", {})
+    complaints: Mapping[str, str] = getattr(answers, "complaints", {})
+    values: dict[str, object] = {
+        "policy": answers.policy.name,
+        "run_id": answers.run.run_id if answers.run else "",
+        "mode": decider.mode.name.lower(),
+        "condition": decider.trust.condition.name,
+        "reason": supervisor.REASON_TEXT[decider.trust.reason],
+        "other_policies": others,
+        **answers.counters,
+        **{f"latency_{key}": value for key, value in latencies.summary.items()},
+    }
+    values |= {f"missing_{name}": complaints.get(name, why) for name, why in missing.items()}
+    values |= {f"qos_{topic}": f"a peer's {policy}" for topic, policy in mismatches.items()}
+    for name, text in (("implausible", decider.complaint), ("policy_error", decider.trouble)):
+        if text:
+            values[name] = text
+    if log is not None:
+        values["shadow_log"] = log.sum.line
+    return values
+
+
+def warns(answers: Answers, mismatches: Mapping[str, str], others: int) -> bool:
+    """True where somebody should look."""
+    decider = answers.decider
+    trusted = decider.trust.condition in (Condition.INIT, Condition.NOMINAL)
+    doubled = others > 0 and decider.handover.commanding
+    spoken = decider.corrected > 0 or decider.fallbacks > 0
+    return doubled or spoken or bool(mismatches) or not trusted
+
+
+def line_of(answers: Answers, latencies: Latencies, log: ShadowLog | None) -> str:
+    """The end of a node's life in one line; empty where it did nothing."""
+    if not latencies.count and (log is None or not log.sum.ticks):
+        return ""
+    parts = []
+    if latencies.count:
+        ms = {name: 1e3 * latencies.summary[name] for name in ("p50_s", "p99_s", "max_s")}
+        missed = answers.counters.get("missed_ticks")
+        parts.append(
+            f"{latencies.count} commands"
+            + ("" if missed is None else f", {missed} missed ticks")
+            + f", {answers.decider.fallbacks} fallbacks, latency p50 {ms['p50_s']:.2f} ms, "
+            f"p99 {ms['p99_s']:.2f} ms, max {ms['max_s']:.2f} ms"
+        )
+    if log is not None:
+        parts.append(log.sum.line)
+    return "; ".join(parts)
+
+
+def write_report(path: Path, values: Mapping[str, object]) -> None:
+    """The values as JSON, whole or not at all. Raises ConfigError where it cannot be written."""
+    document: dict[str, Any] = dict(values)
+    write_json(path, document)

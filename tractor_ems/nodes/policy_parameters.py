@@ -1,0 +1,67 @@
+"""The parameters that every policy node has, each with unit and range. Nothing else."""
+
+from tractor_ems.handover import DEFAULT_RAMP_W_PER_S
+from tractor_msgs_py.ros.shell import Parameter
+from tractor_msgs_py.ros.wire import HISTORY_DEPTH
+from tractor_sim.plant_run import UNSET_SOC
+
+UNSET_RAMP = -1.0
+COMMON = (
+    Parameter("allow_other_powertrain", False, "drive a powertrain the policy was not made for"),
+    Parameter(
+        "observation_timeout_s",
+        2.0,
+        "real time: fall back after silence of",
+        "s",
+        0.01,
+        60,
+        dynamic=True,
+    ),
+    Parameter(
+        "signals",
+        "",
+        "signal map of a vehicle, a shipped name or a YAML file; empty: the simulator's topics, "
+        "or map signals for a policy that was trained on sampled signals",
+    ),
+    Parameter(
+        "dt_s",
+        0.1,
+        "signals: decide every, for a policy without a period of its own",
+        "s",
+        0.001,
+        3600,
+    ),
+    Parameter(
+        "time_scale", 1.0, "signals: seconds of stamps per second", "s/s wall clock", 0.01, 1000
+    ),
+    Parameter(
+        "shadow", False, "only say on ~/shadow_command what it would do, until ~/enable is called"
+    ),
+    Parameter(
+        "shadow_log", "", "CSV file for what it would have done against what was done, and JSON"
+    ),
+    Parameter(
+        "ramp_w_per_s",
+        UNSET_RAMP,
+        "most change of generator power at a hand-over, 0 for any, -1 for the powertrain's ramp "
+        f"or {DEFAULT_RAMP_W_PER_S:g}",
+        "W/s",
+        -1,
+        1e9,
+        dynamic=True,
+    ),
+    Parameter("ramp_always", False, "keep to that ramp also while engaged, in real time"),
+    Parameter("report", "", "JSON file for counters and latencies, written at the end"),
+    HISTORY_DEPTH,
+)
+
+SOC_TARGET = Parameter(
+    "soc_target",
+    UNSET_SOC,
+    "SOC to end at, -1 for the run's, the map's or the powertrain's",
+    "fraction",
+    -1,
+    1,
+    dynamic=True,
+)
+"""Of every policy that has not solved its run for a target of its own."""

@@ -1,0 +1,96 @@
+"""A policy on a vehicle: the topics of a signal map in, decisions at every tick out.
+
+Any publisher is heard: subscriptions are best effort, which fits every QoS a vehicle may offer.
+"""
+
+import time
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+
+from tractor_ems.answer_sampled import SampledAnswerer
+from tractor_ems.decide import Decision
+from tractor_ems.nodes.driving_node import DrivingNode
+from tractor_ems.nodes.policy_setup import Paperwork
+from tractor_ems.signals.vehicle import values_of
+from tractor_msgs_py.errors import ConfigError
+from tractor_msgs_py.ros.wire import message_class, subscribe_to
+from tractor_msgs_py.signals import SignalMap, Source
+from tractor_msgs_py.topics import Qos, Topic
+
+ANY_PUBLISHER = Qos("best_effort", depth=200)
+"""Deep enough for a topic that floods while the policy thinks."""
+
+POLL_PER_LAG, POLL_S = 2.0, 0.01
+"""Ticks that wait for late samples are looked for twice per lag, at most every POLL_S [s]."""
+
+
+def by_topic(signals: SignalMap) -> dict[tuple[str, str], list[Source]]:
+    """The sources of each topic and type.
+
+    Raises:
+        ConfigError: a topic is mapped with two types.
+    """
+    found: dict[tuple[str, str], list[Source]] = {}
+    for source in signals.sources:
+        found.setdefault((source.topic, source.type), []).append(source)
+    names = [name for name, _ in found]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ConfigError(f"{signals.origin}: topic {twice[0]}: mapped with two types")
+    return found
+
+
+class VehicleNode(DrivingNode):
+    """Wires one ``SampledAnswerer`` to a vehicle's topics."""
+
+    def __init__(
+        self,
+        node: Node,
+        answerer: SampledAnswerer,
+        history_depth: int,
+        papers: Paperwork | None = None,
+    ) -> None:
+        self._answerer = answerer
+        super().__init__(node, answerer, history_depth, papers)
+
+    def _listen(self) -> None:
+        node, answerer = self._node, self._answerer
+        for (name, type_name), sources in by_topic(answerer.signals).items():
+            try:
+                kind = message_class(type_name)
+            except ConfigError as error:
+                raise ConfigError(f"{answerer.signals.origin}: topic {name}: {error}") from None
+            topic = Topic(name, type_name, ANY_PUBLISHER)
+            subscribe_to(node, topic, self._on_message(sources), self.outlet.mismatch, kind)
+        period_s = max(answerer.spec.lag_s / POLL_PER_LAG, POLL_S)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_timer(min(period_s, answerer.dt_s / 2), self._poll, clock=steady)
+
+    def _on_message(self, sources: list[Source]) -> Callable[[Any, Any], None]:
+        def on_message(msg: Any, info: Any) -> None:
+            now_ns = time.monotonic_ns()
+            values = values_of(sources, msg, info["source_timestamp"])
+            if len(values) < len(sources):
+                self._answerer.refusals["malformed"] += 1
+            self._say(self._answerer.sense(values, now_ns, self._heard()), now_ns)
+
+        return on_message
+
+    def _poll(self) -> None:
+        now_ns = time.monotonic_ns()
+        self._say(self._answerer.poll(now_ns, self._heard()), now_ns)
+
+    def _heard(self) -> bool:
+        return self._answerer.decider.handover.commanding and self.outlet.listeners() > 0
+
+    def _say(self, decisions: Iterable[Decision], since_ns: int) -> None:
+        """Every decision is followed, the newest command alone is published."""
+        command = None
+        for decision in decisions:
+            self._follow(decision)
+            command = decision.command or command
+        self.outlet.say(command, since_ns)
