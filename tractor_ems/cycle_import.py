@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from tractor_msgs_py.errors import BagError, ConfigError, CycleError
+from tractor_msgs_py.signals import SignalMap
 from tractor_msgs_py.topics import POWER_DEMAND
 from tractor_msgs_py.trajectory import FloatArray
 from tractor_msgs_py.types import PowerDemand
@@ -15,7 +16,13 @@ from tractor_sim.duty_cycle.resample import Account, ImportSettings, Samples, re
 
 
 def import_cycle(
-    source: Path, out: Path, settings: ImportSettings, *, force: bool = False
+    source: Path,
+    out: Path,
+    settings: ImportSettings,
+    *,
+    force: bool = False,
+    signals: SignalMap | None = None,
+    namespace: str | None = None,
 ) -> tuple[list[Path], Account]:
     """Read, clean, resample and write a recording.
 
@@ -24,6 +31,8 @@ def import_cycle(
         out: CSV to write; several pieces are numbered, ``OUT_1.csv`` and so on.
         settings: what to repair.
         force: replace files that exist.
+        signals: the map of a vehicle, if the source is its bag.
+        namespace: of the map's relative topics; None: the only one that fits.
 
     Returns:
         The files written and the account.
@@ -35,8 +44,15 @@ def import_cycle(
         ConfigError: ``out`` is no CSV name, exists, or cannot be written.
     """
     check_out(out, force)
-    read = _from_csv if source.suffix.lower() == ".csv" else _from_bag
-    pieces, account = resample(read(source, settings.aux_w), settings)
+    if source.suffix.lower() == ".csv":
+        if signals is not None:
+            raise ConfigError(f"{source}: --signals is for bags, a CSV has its own columns")
+        samples = _from_csv(source, settings.aux_w)
+    elif signals is not None:
+        samples = _from_vehicle(source, settings.aux_w, signals, namespace)
+    else:
+        samples = _from_bag(source, settings.aux_w)
+    pieces, account = resample(samples, settings)
     paths = [out]
     if len(pieces) > 1:
         paths = [out.with_name(f"{out.stem}_{n}{out.suffix}") for n in range(1, len(pieces) + 1)]
@@ -110,6 +126,33 @@ def _from_bag(path: Path, aux_w: float | None) -> Samples:
     if aux_w is not None:
         return _less(samples, aux_w, "--aux-w")
     return replace(samples, auxiliaries="unknown, not removed")
+
+
+def _from_vehicle(
+    path: Path, aux_w: float | None, signals: SignalMap, namespace: str | None
+) -> Samples:
+    """Every value of the demand in a vehicle's bag, less its auxiliaries."""
+    from tractor_ems.bags.sampled import series_of
+
+    series = series_of(path, signals, "power_demand_w", namespace)
+    if series.runs > 1:
+        raise BagError(
+            f"{path}: {series.runs} runs with a power demand, a cycle needs exactly one"
+        )
+    stamp_ns = series.stamp_ns
+    samples = Samples(
+        str(path),
+        np.arange(1, len(stamp_ns) + 1),
+        (stamp_ns - stamp_ns[0]).astype(np.float64) * 1e-9,
+        series.value,
+        place_name="value",
+        refused=["" if stamp > 0 else "zero_stamp" for stamp in stamp_ns.tolist()],
+    )
+    if aux_w is not None:
+        return _less(samples, aux_w, "--aux-w")
+    if series.info is not None:
+        return _less(samples, series.info.p_aux_w, "announced by the recording")
+    return _less(samples, signals.p_aux_w, "of the signal map")
 
 
 def _less(samples: Samples, aux_w: float, known_from: str) -> Samples:

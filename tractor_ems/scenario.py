@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from tractor_msgs_py.errors import ConfigError, CycleError
+from tractor_msgs_py.signals import SignalMap
 from tractor_msgs_py.trajectory import FloatArray
 from tractor_sim.config import load_powertrain
 from tractor_sim.duty_cycle.cycle import DutyCycle
@@ -39,6 +40,9 @@ def make_scenario(
     cycle: str,
     soc_initial: float | None = None,
     soc_target: float | None = None,
+    *,
+    signals: SignalMap | None = None,
+    namespace: str | None = None,
 ) -> Scenario:
     """Resolve names and files.
 
@@ -47,6 +51,9 @@ def make_scenario(
         cycle: shipped name, CSV file or bag folder.
         soc_initial: None: the powertrain's.
         soc_target: None: the powertrain's, or else the initial SOC.
+        signals: the map of a vehicle, if the cycle is its bag; its demand is then sampled every
+            step of the powertrain.
+        namespace: of the map's relative topics; None: the only one that fits.
 
     Raises:
         ConfigError: unknown powertrain, or a SOC outside its window.
@@ -54,7 +61,12 @@ def make_scenario(
         BagError: the bag cannot be read or holds no demand.
     """
     params = load_powertrain(powertrain)
-    duty_cycle = resolve_cycle(cycle)
+    if signals is not None and is_bag(cycle):
+        from tractor_ems.bags.sampled_traces import cycle_of_sampled_bag
+
+        duty_cycle = cycle_of_sampled_bag(Path(cycle), signals, params.dt_s, namespace)
+    else:
+        duty_cycle = resolve_cycle(cycle)
     if abs(duty_cycle.dt_s - params.dt_s) > 1e-9:
         raise CycleError(
             f"cycle {duty_cycle.name}: dt_s {duty_cycle.dt_s}, powertrain {params.name} "
@@ -75,9 +87,14 @@ def resolve_cycle(text: str) -> DutyCycle:
 
     A file that holds a shipped cycle's demand is in that cycle's split.
     """
-    path = Path(text)
-    if path.is_dir() or path.suffix == ".mcap":
+    if is_bag(text):
         from tractor_ems.bags.transitions import cycle_of_bag
 
-        return with_shipped_split(cycle_of_bag(path))
+        return with_shipped_split(cycle_of_bag(Path(text)))
     return with_shipped_split(load_cycle(text))
+
+
+def is_bag(text: str) -> bool:
+    """Whether a cycle is named by a bag: a folder, or a storage file."""
+    path = Path(text)
+    return path.is_dir() or path.suffix in (".mcap", ".db3")

@@ -140,6 +140,12 @@ def import_(
         float | None,
         typer.Option(help="Auxiliaries within the demand, if the recording announces none [W]."),
     ] = None,
+    signals: Annotated[
+        str | None, typer.Option(help="Signal map of a vehicle's bag: name, or YAML file.")
+    ] = None,
+    namespace: Annotated[
+        str | None, typer.Option(help="Of the map's topics; default the only one that fits.")
+    ] = None,
     force: Force = False,
     json: JsonFlag = False,
 ) -> None:
@@ -149,10 +155,18 @@ def import_(
     whether samples are closer than the step or further apart.
     """
     from tractor_ems.cycle_import import import_cycle
+    from tractor_ems.signals.config import optional_map
     from tractor_sim.duty_cycle.resample import ImportSettings
 
     settings = ImportSettings(dt, max_gap_s, max_power_w, max_dropped, split_gaps, aux_w)
-    paths, account = import_cycle(source, out, settings, force=force)
+    paths, account = import_cycle(
+        source,
+        out,
+        settings,
+        force=force,
+        signals=optional_map(signals, namespace),
+        namespace=namespace,
+    )
     document = {"source": str(source), "files": [str(path) for path in paths], "dt_s": dt}
     document |= account.to_json()
     if json:

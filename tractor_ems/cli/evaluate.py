@@ -55,6 +55,13 @@ def evaluate(
     allow_other_powertrain: Annotated[
         bool, typer.Option(help="Drive a powertrain the policy was not made for.")
     ] = False,
+    signals: Annotated[
+        str | None,
+        typer.Option(help="Signal map of a vehicle whose bag is the cycle: name, or YAML file."),
+    ] = None,
+    namespace: Annotated[
+        str | None, typer.Option(help="Of the map's topics; default the only one that fits.")
+    ] = None,
     soc_guard: Annotated[bool, typer.Option(help="SOC guard of rule_based.")] = True,
     dp: Annotated[bool, typer.Option("--dp/--no-dp", help="Score against DP.")] = True,
     jobs: Annotated[
@@ -70,13 +77,21 @@ def evaluate(
     """
     from tractor_ems.evaluate_set import Options, pairs
     from tractor_ems.scenario import make_scenario
+    from tractor_ems.signals.config import optional_map
 
     kinds: dict[str, Transport] = {"in_process": "in_process", "ros": "ros"}
     if transport not in kinds:
         raise ConfigError(f"--transport: {transport!r}, allowed {', '.join(kinds)}")
     options = Options(kinds[transport], allow_other_powertrain, soc_guard, dp)
+    vehicle = optional_map(signals, namespace)
+    if vehicle is not None and transport == "ros":
+        raise ConfigError(
+            "--signals: allowed with --transport in_process; ems cycle import makes a cycle of "
+            "the bag that nodes can drive"
+        )
     scenarios = [
-        make_scenario(powertrain, name, soc0, soc_target) for name in _cycles(cycle, cycle_set)
+        make_scenario(powertrain, name, soc0, soc_target, signals=vehicle, namespace=namespace)
+        for name in _cycles(cycle, cycle_set)
     ]
     runs = pairs(_policies(policy), scenarios)
     if len(runs) == 1 and not cycle_set:

@@ -43,6 +43,13 @@ def train(
     allow_held_out: Annotated[
         bool, typer.Option(help="Learn from bags of held-out cycles; scores on those then lie.")
     ] = False,
+    signals: Annotated[
+        str | None,
+        typer.Option(help="Signal map of a vehicle's bags: name, or YAML file (config/signals*)."),
+    ] = None,
+    namespace: Annotated[
+        str | None, typer.Option(help="Of the map's topics; default the only one that fits.")
+    ] = None,
     resume: Annotated[
         bool, typer.Option(help="Go on from an interrupted run's checkpoint.")
     ] = False,
@@ -51,11 +58,15 @@ def train(
 ) -> None:
     """Train a double DQN offline from recorded bags and write a policy file.
 
+    With --signals the bags are sampled every step of the powertrain (--powertrain
+    paper:dt_s=0.1 for 10 Hz), and so will the policy.
+
     Ctrl-C leaves a checkpoint beside the output; --resume goes on from it and gives the same
     bytes as a run that was never interrupted.
     """
     from tractor_ems.learning.config import load_train_config, rule_share_of
     from tractor_ems.learning.train import train as run
+    from tractor_ems.signals.config import optional_map
 
     overrides: dict[str, Any] = {
         "targets": targets,
@@ -95,6 +106,8 @@ def train(
             progress=show,
             resume=resume,
             tensorboard=tensorboard,
+            signals=optional_map(signals, namespace),
+            namespace=namespace,
         )
     if json:
         print_json(report.to_json())

@@ -38,8 +38,9 @@ class CounterfactualConfig:
         batch: samples (bag, time, SOC, target) per step; both engine states of each are used.
         learning_rate: of Adam, held for ``hold_fraction`` of the updates, then lowered along a
             cosine to ``final_fraction`` of it.
-        gamma: discount per step.
-        target_rate: share of the online net that the target net takes over per update.
+        gamma: discount per second; over a step of dt_s it is ``gamma ** dt_s``.
+        target_rate: share of the online net that the target net takes over per update at steps
+            of 1 s; at shorter ones in proportion more, for as many more steps reach as far.
         double: choose with the online net, evaluate with the target net; else the target net
             does both.
         loss: on the value error in cost units (10 g).
@@ -67,7 +68,7 @@ class SampledConfig:
         updates: gradient steps.
         batch: transitions per step.
         learning_rate: of Adam, with the same schedule as in ``CounterfactualConfig``.
-        gamma: discount per step.
+        gamma: discount per second; over a step of dt_s it is ``gamma ** dt_s``.
         target_rate: soft update per step; 1 with ``target_every`` above 1 is a hard copy.
         target_every: updates between target updates.
         double: double DQN; False is plain DQN.
@@ -158,6 +159,16 @@ class TrainConfig:
     def to_json(self) -> dict[str, Any]:
         """Plain data, for policy files and checkpoints."""
         return asdict(self)
+
+
+def step_discount(mode: CounterfactualConfig | SampledConfig, dt_s: float) -> float:
+    """Discount over one step of ``dt_s`` seconds, so that a horizon is a time, not a count."""
+    return float(mode.gamma**dt_s)
+
+
+def step_target_rate(config: CounterfactualConfig, dt_s: float) -> float:
+    """Share of the online net that the target net takes over per update at steps of ``dt_s``."""
+    return min(config.target_rate / dt_s, 1.0)
 
 
 def learning_rate(mode: CounterfactualConfig | SampledConfig, step: int) -> float:

@@ -25,7 +25,12 @@ from tractor_ems.learning.all_actions import (
     build_cost_table,
     enumerate_actions,
 )
-from tractor_ems.learning.config import CounterfactualConfig, learning_rate
+from tractor_ems.learning.config import (
+    CounterfactualConfig,
+    learning_rate,
+    step_discount,
+    step_target_rate,
+)
 from tractor_ems.learning.networks import (
     Net,
     adam_tensors,
@@ -54,7 +59,8 @@ from tractor_sim.powertrain import (
 class Problem:
     """What a backup needs besides the networks.
 
-    ``baseline`` has one entry per tick of ``samples`` [cost units].
+    ``gamma`` is the discount per step; ``baseline`` has one entry per tick of ``samples``
+    [cost units].
     """
 
     params: PowertrainParams
@@ -98,7 +104,7 @@ def make_problem(
         params,
         reward,
         scaling,
-        config.gamma,
+        step_discount(config, params.dt_s),
         config.double,
         samples,
         table,
@@ -244,6 +250,7 @@ class CounterfactualLearner:
         self.problem, self.config = problem, config
         self.rng = sample_rng
         self.step = 0
+        self.target_rate = step_target_rate(config, problem.params.dt_s)
         sizes = (problem.samples.inputs.shape[1] + 1, *config.hidden, 2)
         self.online = Net(sizes, config.activation, init_rng)
         self.target = Net(sizes, config.activation, init_rng)
@@ -276,7 +283,7 @@ class CounterfactualLearner:
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimiser.step()
-        copy_towards(self.target, self.online, config.target_rate)
+        copy_towards(self.target, self.online, self.target_rate)
         self.step += 1
         return {"losses/td_loss": loss.detach(), "losses/q_values": -w.detach().mean()}
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from tractor_ems.learning.config import SampledConfig, TrainConfig
+from tractor_ems.learning.config import SampledConfig, TrainConfig, step_discount
 from tractor_ems.learning.dqn import SampledLearner
 from tractor_ems.learning.interact import episode, episode_cycles, training_demand_w
 from tractor_ems.learning.recorded import Drive, drive_of_trace, replay_transitions
@@ -28,6 +28,7 @@ from tractor_ems.learning.samples import (
 )
 from tractor_ems.policies.mlp import Mlp
 from tractor_ems.policies.q_policy import Normalisation, QPolicy
+from tractor_ems.signals.vehicle import sampled_spec
 from tractor_msgs_py.errors import ConfigError
 from tractor_msgs_py.observation import ObservationSpec
 from tractor_msgs_py.trajectory import FloatArray
@@ -67,7 +68,7 @@ class Experiment:
             reward=self.reward,
             net=net,
             scaling=self.scaling,
-            gamma=self.config.mode.gamma,
+            gamma=step_discount(self.config.mode, self.params.dt_s),
             actions=self.config.actions,
             metadata=metadata or {},
         )
@@ -108,6 +109,9 @@ def prepare(
     recorded = distinct_demands(recordings.traces)
     demands = [servable_demand_w(params, demand_w) for demand_w in (*recorded, *simulated)]
     scaling = demand_scaling(demands)
+    spec = observation_spec(scaling, params.dt_s, config.mean_prior_s, config.low_pass_s)
+    if recordings.signals is not None:  # it will drive a vehicle with such signals
+        spec = sampled_spec(recordings.signals, params.dt_s, spec.filters)
     return Experiment(
         config=config,
         params=params,
@@ -115,7 +119,7 @@ def prepare(
         recordings=recordings,
         demands_w=tuple(demands),
         episodes=episodes,
-        spec=observation_spec(scaling, params.dt_s, config.mean_prior_s, config.low_pass_s),
+        spec=spec,
         scaling=scaling,
     )
 
@@ -219,7 +223,7 @@ def to_replay(
         experiment.reward,
         experiment.spec,
         experiment.scaling,
-        mode.gamma,
+        step_discount(mode, experiment.params.dt_s),
         actions,
     )
 

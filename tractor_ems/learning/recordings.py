@@ -1,13 +1,16 @@
 """Which recordings a training run learns from: read, checked, sorted by who drove."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from tractor_ems.bags.sampled_traces import iter_sampled_traces
 from tractor_ems.bags.transitions import Trace, iter_traces
 from tractor_msgs_py.errors import BagError
+from tractor_msgs_py.signals import SignalMap
 from tractor_msgs_py.trajectory import FloatArray
 from tractor_sim.duty_cycle.shipped import held_out_name
 from tractor_sim.powertrain import PowertrainParams
@@ -19,7 +22,7 @@ EXPERT = ("dp", "")
 
 @dataclass(frozen=True)
 class Recordings:
-    """Traces by who drove them.
+    """Traces by who drove them, and the map through which they were read, if through one.
 
     Attributes:
         dp: from ``bags``, driven by DP, by nobody that is known, or demand only.
@@ -28,6 +31,7 @@ class Recordings:
 
     dp: tuple[Trace, ...]
     rule: tuple[Trace, ...]
+    signals: SignalMap | None = None
 
     @property
     def traces(self) -> tuple[Trace, ...]:
@@ -40,12 +44,22 @@ class Recordings:
         return sorted({trace.bag_hash for trace in self.traces if trace.bag_hash})
 
     @property
-    def identity(self) -> dict[str, list[str]]:
+    def identity(self) -> dict[str, Any]:
         """What must be equal for a run to be resumed: who counts as expert is part of it."""
         return {
             "dp_bag_hashes": sorted({trace.bag_hash for trace in self.dp}),
             "rule_bag_hashes": sorted({trace.bag_hash for trace in self.rule}),
+            **self.map_json,
         }
+
+    @property
+    def map_json(self) -> dict[str, Any]:
+        """The signal map as plain data under ``signals``; empty where there is none."""
+        if self.signals is None:
+            return {}
+        data = asdict(self.signals)
+        del data["origin"]  # a path of this machine
+        return {"signals": data}
 
     @property
     def cycle_hashes(self) -> list[str]:
@@ -65,18 +79,30 @@ def read_recordings(
     *,
     allow_other_powertrain: bool = False,
     allow_held_out: bool = False,
+    signals: SignalMap | None = None,
+    namespace: str | None = None,
+    driven: bool = False,
 ) -> Recordings:
     """Read and check every bag at or below the given paths.
 
-    Traces are in an order of their own, by bag hash, run and time: the names and the order of the
-    bags decide nothing.
+    With ``signals`` they are a vehicle's bags, sampled every step of the powertrain (see
+    ``iter_sampled_traces`` for ``namespace`` and ``driven``), else the project's own. Traces are
+    in an order of their own, by bag hash, run and time: the names and the order of the bags
+    decide nothing.
 
     Raises:
         BagError: a bag cannot be read, steps by another time, was recorded on another powertrain
             or on a held-out cycle (unless those are allowed).
     """
-    given = iter_traces(bags) if bags else []
-    rule = iter_traces(rule_bags) if rule_bags else []
+
+    def read(paths: Sequence[Path]) -> list[Trace]:
+        if not paths:
+            return []
+        if signals is None:
+            return iter_traces(paths)
+        return iter_sampled_traces(paths, signals, params.dt_s, namespace=namespace, driven=driven)
+
+    given, rule = read(bags), read(rule_bags)
     for trace in (*given, *rule):
         check_trace(trace, params, allow_other_powertrain=allow_other_powertrain)
         if not allow_held_out:
@@ -84,6 +110,7 @@ def read_recordings(
     return Recordings(
         dp=_in_order(trace for trace in given if trace.policy in EXPERT),
         rule=_in_order((*(trace for trace in given if trace.policy not in EXPERT), *rule)),
+        signals=signals,
     )
 
 
@@ -93,11 +120,31 @@ def _in_order(traces: Iterable[Trace]) -> tuple[Trace, ...]:
 
 def _refuse_held_out(trace: Trace) -> None:
     name = held_out_name(trace.power_demand_w, trace.dt_s, trace.cycle_hash, trace.cycle)
+    name = name or _held_out_at_a_finer_step(trace)
     if name is not None:
         raise BagError(
             f"{trace.bag}: drives {name}, a held-out cycle that training must not see "
             "(unless allow_held_out says so)"
         )
+
+
+def _held_out_at_a_finer_step(trace: Trace) -> str | None:
+    """A held-out cycle that was recorded several times per second of it, whole and not rounded.
+
+    Cycles are listed at steps of 1 s. Which sample is a second's first is not known, nor whether
+    the recording caught the first and the last second.
+    """
+    per_second = round(1.0 / trace.dt_s)
+    if per_second < 2 or abs(per_second * trace.dt_s - 1.0) > 1e-9:
+        return None
+    for phase in range(per_second):
+        seconds_w = trace.power_demand_w[phase::per_second]
+        for begin, end in ((0, None), (1, None), (0, -1), (1, -1)):
+            if len(seconds_w) > 3:
+                name = held_out_name(seconds_w[begin:end], 1.0)
+                if name is not None:
+                    return name
+    return None
 
 
 def check_trace(trace: Trace, params: PowertrainParams, *, allow_other_powertrain: bool) -> None:

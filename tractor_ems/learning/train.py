@@ -23,6 +23,7 @@ from tractor_ems.policies.q_policy import save_policy
 from tractor_msgs_py import __version__
 from tractor_msgs_py.errors import ConfigError, RunAborted
 from tractor_msgs_py.provenance import command_line as own_command_line
+from tractor_msgs_py.signals import SignalMap
 from tractor_sim.config import load_powertrain
 from tractor_sim.powertrain import PowertrainParams
 from tractor_sim.powertrain_json import powertrain_hash
@@ -75,6 +76,8 @@ def train(
     resume: bool = False,
     tensorboard: Path | None = None,
     command_line: str | None = None,
+    signals: SignalMap | None = None,
+    namespace: str | None = None,
 ) -> TrainReport:
     """Train from bags and write the policy file ``out``, with its log ``STEM.jsonl`` beside it.
 
@@ -88,6 +91,9 @@ def train(
         tensorboard: folder for TensorBoard logs.
         command_line: what to record as the command that made the policy; None: this process's.
             A resumed run records that of the run it goes on from.
+        signals: the map of a vehicle whose bags these are; the policy then drives ``sampled``,
+            every step of the powertrain. None: bags of the project's own topics.
+        namespace: of the map's relative topics; None: the only one that fits.
 
     Raises:
         BagError: a bag cannot be read or does not fit.
@@ -104,6 +110,9 @@ def train(
         params,
         allow_other_powertrain=config.allow_other_powertrain,
         allow_held_out=config.allow_held_out,
+        signals=signals,
+        namespace=namespace,
+        driven=config.targets == "sampled",
     )
     return train_on(
         config,
@@ -186,6 +195,7 @@ def train_on(
                 "command_line": origin,
                 "config": config.to_json(),
                 "seed": config.seed,
+                **recordings.map_json,
                 "bag_hashes": recordings.bag_hashes,
                 "cycle_hashes": recordings.cycle_hashes,
                 "cycles": sorted({*recordings.cycles, *experiment.episodes}),

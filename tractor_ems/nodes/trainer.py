@@ -19,6 +19,7 @@ from std_msgs.msg import String
 from tractor_ems.learning.config import load_train_config, rule_share_of
 from tractor_ems.learning.rewards import RewardKind
 from tractor_ems.learning.train import TrainReport, train
+from tractor_ems.signals.config import optional_map
 from tractor_msgs_py.errors import ConfigError, TractorEmsError
 from tractor_msgs_py.ros.shell import Parameter, qos_profile, run_node
 from tractor_msgs_py.topics import Qos
@@ -35,6 +36,7 @@ PARAMETERS = (
     Parameter("targets", "", "empty: the preset's, or else counterfactual", choices=TARGETS),
     Parameter("reward", "", "empty: the preset's", choices=("", *get_args(RewardKind))),
     Parameter("powertrain", "paper", "shipped name or YAML file of the powertrain"),
+    Parameter("signals", "", "signal map of a vehicle's bags; empty: the project's own topics"),
     Parameter("updates", 0, "gradient steps, 0: the preset's", "", 0, 100_000_000),
     Parameter("seed", -1, "seed of every generator, -1: the preset's", "", -1, 2**62),
     Parameter("interact", -1, "simulated episodes to add, -1: the preset's", "", -1, 1_000_000),
@@ -78,6 +80,7 @@ class Trainer:
                     progress=self._note,
                     stop=self._stop.is_set,
                     resume=values["resume"],
+                    signals=optional_map(values["signals"]),
                 )
             except BaseException as error:
                 self._error = error

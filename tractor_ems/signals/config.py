@@ -91,6 +91,19 @@ def load_signal_map(name_or_path: str | Path = DEFAULT) -> SignalMap:
         raise ConfigError(f"{path}: {error}") from None
 
 
+def optional_map(name_or_path: str | None, namespace: str | None = None) -> SignalMap | None:
+    """The map of an option that may be left out.
+
+    Raises:
+        ConfigError: as :func:`load_signal_map`, or a namespace without a map.
+    """
+    if name_or_path:
+        return load_signal_map(name_or_path)
+    if namespace:
+        raise ConfigError(f"namespace: {namespace}, allowed beside signals")
+    return None
+
+
 def _signal(name: str, item: _Signal) -> MappedSignal:
     where = f"signals.{name}"
     if name not in SIGNALS:
