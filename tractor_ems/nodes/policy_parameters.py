@@ -3,9 +3,8 @@
 from tractor_ems.handover import DEFAULT_RAMP_W_PER_S
 from tractor_msgs_py.ros.shell import Parameter
 from tractor_msgs_py.ros.wire import HISTORY_DEPTH
-from tractor_sim.plant_run import UNSET_SOC
 
-UNSET_RAMP = -1.0
+UNSET = -1.0
 COMMON = (
     Parameter("allow_other_powertrain", False, "drive a powertrain the policy was not made for"),
     Parameter(
@@ -42,7 +41,7 @@ COMMON = (
     ),
     Parameter(
         "ramp_w_per_s",
-        UNSET_RAMP,
+        UNSET,
         "most change of generator power at a hand-over, 0 for any, -1 for the powertrain's ramp "
         f"or {DEFAULT_RAMP_W_PER_S:g}",
         "W/s",
@@ -57,7 +56,7 @@ COMMON = (
 
 SOC_TARGET = Parameter(
     "soc_target",
-    UNSET_SOC,
+    UNSET,
     "SOC to end at, -1 for the run's, the map's or the powertrain's",
     "fraction",
     -1,
