@@ -88,7 +88,7 @@ def test_the_manifest_depends_on_exactly_what_has_a_key(manifest):
 
 
 def test_nothing_is_depended_on_that_nobody_imports(by_package):
-    assert not set(KEYS) - {"std_srvs"} - by_package
+    assert not set(KEYS) - by_package
 
 
 def test_what_has_no_key_is_named_in_the_manifest():
