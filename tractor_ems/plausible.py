@@ -48,12 +48,17 @@ class Plausible:
         soc_per_s: most that the SOC moves in a second, tolerance aside, > 0 [1/s].
         soc_tolerance: what it may always move, 0..1.
         frozen_j: energy that must have moved a SOC that lives, > 0 [J].
+        battery_w: most the battery gives or takes, > 0 [W].
+        empty_soc, full_soc: where it may give or take nothing any more.
     """
 
     demand_max_w: float
     soc_per_s: float
     soc_tolerance: float
     frozen_j: float
+    battery_w: float
+    empty_soc: float
+    full_soc: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +116,9 @@ def plausible_on(
         soc_per_s=RATE_FACTOR * fastest_soc_per_s(params.battery),
         soc_tolerance=soc_tolerance,
         frozen_j=max(FROZEN_SOC, FROZEN_STEPS * soc_step) * params.battery.energy_j,
+        battery_w=params.battery.power_max_w,
+        empty_soc=params.battery.soc_min + soc_tolerance,
+        full_soc=params.battery.soc_max - soc_tolerance,
     )
 
 
@@ -138,7 +146,7 @@ def judge(
         jump the SOC stays implausible until it is back where it could have got to meanwhile.
     """
     demand_w, soc = float(observation.power_demand_w[0]), float(observation.soc[0])
-    flowed_j = _flowed_j(seen, observation) if soc == seen.soc else 0.0
+    flowed_j = _flowed_j(allowed, seen, observation) if soc == seen.soc else 0.0
     now = replace(
         seen,
         stamp_ns=observation.stamp_ns,
@@ -188,14 +196,16 @@ def _frozen(allowed: Plausible, now: Seen) -> str | None:
     )
 
 
-def _flowed_j(seen: Seen, observation: Observation) -> float:
+def _flowed_j(allowed: Plausible, seen: Seen, observation: Observation) -> float:
     """Net energy out of the battery since the SOC changed: the last demand, less what the engine
-    gave, as far as the battery's limits let it."""
+    gave, as far as the battery's limits let it. Near the ends of its window, where it takes or
+    gives less than anybody may have published, nothing counts in that direction."""
     gap_s = (observation.stamp_ns - seen.stamp_ns) * 1e-9
     power_w = seen.demand_w - float(observation.engine_power_w[0])
     if not (0.0 < gap_s <= FLOW_GAP_S and math.isfinite(power_w)):
         return seen.flowed_j
-    # Not min(): a limit that is NaN does not limit.
-    power_w = seen.discharge_w if power_w > seen.discharge_w else power_w
-    power_w = -seen.charge_w if power_w < -seen.charge_w else power_w
+    out_w = 0.0 if seen.soc <= allowed.empty_soc else allowed.battery_w
+    in_w = 0.0 if seen.soc >= allowed.full_soc else allowed.battery_w
+    # The published limit last: where it is NaN, min keeps the first.
+    power_w = max(min(power_w, min(out_w, seen.discharge_w)), -min(in_w, seen.charge_w))
     return seen.flowed_j + power_w * gap_s

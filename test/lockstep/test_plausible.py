@@ -116,6 +116,11 @@ def test_a_still_soc_is_fine_while_no_energy_flows_or_none_can():
     assert not any(findings(still)) and not any(findings(full))
 
 
+@pytest.mark.parametrize(("soc", "engine_w"), [(0.80, 180e3), (0.79, 180e3), (0.31, 20e3)])
+def test_a_full_battery_takes_nothing_and_an_empty_one_gives_nothing_said_or_not(soc, engine_w):
+    assert not any(findings([observation(k, soc, engine_w=engine_w) for k in range(300)]))
+
+
 def test_braking_and_boosting_that_cancel_leave_the_soc_where_it_was():
     demand_w = [150e3, 50e3] * 200
     assert not any(findings(observation(k, demand_w=w) for k, w in enumerate(demand_w)))
