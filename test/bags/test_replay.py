@@ -8,7 +8,7 @@ import pytest
 
 from tractor_ems.bags.in_process import write_demand_bag, write_samples_bag
 from tractor_ems.bags.replay import demand_of, without_auxiliaries
-from tractor_ems.bags.replay_demand import LEAD, RESEND_S, DemandReplay
+from tractor_ems.bags.replay_demand import LEAD_S, RESEND_S, DemandReplay
 from tractor_ems.bags.replay_schedule import Answered, Timed, lockstep_run
 from tractor_ems.bags.replay_topics import Choice, RawMessage, messages_of, recorded_topics
 from tractor_ems.bags.rosbags_messages import RosbagsMessages, serialize
@@ -159,9 +159,10 @@ def test_a_real_time_schedule_leads_its_ticks_and_never_drifts():
     player.poll(1, 0.0)
     player.observe(PowerDemand(info.stamp_ns(0), AUX_W), 50.0)
     k = steps_count // 2
-    due_s = 50.0 + (k - LEAD) * 0.1
-    for j in range(1, k):  # each poll is late by most of a period; the schedule does not move
-        assert len(player.poll(1, 50.0 + (j - LEAD) * 0.1 + 0.09)) == 1
+    due_s = 50.0 + k * 0.1 - LEAD_S
+    assert len(player.poll(1, 50.0)) == 2, "steps 1 and 2 are within the lead"
+    for j in range(3, k):  # each poll is late by most of a period; the schedule does not move
+        assert len(player.poll(1, 50.0 + j * 0.1 - LEAD_S + 0.09)) == 1
         player.observe(PowerDemand(info.stamp_ns(j), AUX_W), 50.0 + j * 0.1)
     assert player.poll(1, due_s - 1e-3) == ()
     assert len(player.poll(1, due_s + 1e-3)) == 1

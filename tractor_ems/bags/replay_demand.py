@@ -1,8 +1,8 @@
 """When a player publishes which step of a duty cycle, and how the plant took it.
 
 A pure state machine: time comes in as a steady clock's seconds, samples to publish come out.
-In lockstep step k + 1 follows tick k. In real time step k is due half a period before its tick,
-on a schedule that begins with the plant's first tick and is never shifted, so nothing drifts.
+In lockstep step k + 1 follows tick k. In real time step k is due a little before its tick, on a
+schedule that begins with the plant's first tick and is never shifted, so nothing drifts.
 """
 
 from tractor_msgs_py import topics
@@ -13,8 +13,9 @@ from tractor_msgs_py.types import DutyCycleDemand, DutyCycleInfo, PowerDemand, R
 RESEND_S = 0.2
 """A demand that a waiting plant has not driven is published again after this long [s]."""
 
-LEAD = 0.5
-"""How far ahead of its tick a demand is published in real time, in periods."""
+LEAD_PERIODS, LEAD_S = 0.5, 0.25
+"""How far ahead of its tick a demand is published in real time, whichever is more: the plant keeps
+it, so that a machine that makes the player wait for a moment costs nothing [-], [s]."""
 
 
 class DemandReplay:
@@ -47,6 +48,7 @@ class DemandReplay:
         self._info = info
         self._power_w = power_demand_w.tolist()
         self._period_s = period_s
+        self._lead_s = max(LEAD_PERIODS * period_s, LEAD_S)
         self._match_timeout_s = match_timeout_s
         self._plant_timeout_s = plant_timeout_s + period_s
         self._since_s: float | None = None
@@ -160,13 +162,15 @@ class DemandReplay:
         if not self._period_s:
             return min(self.seen + 2, self._info.steps)
         assert self._start_s is not None
-        passed = (now_s - self._start_s) / self._period_s + LEAD
+        passed = (now_s - self._start_s + self._lead_s) / self._period_s
         return max(self._next, min(int(passed) + 1, self._info.steps))
 
     def _account(self, first: int, end: int, now_s: float) -> None:
         if not self._period_s or self._start_s is None:
             return
         for k in range(first, end):
-            behind_s = now_s - (self._start_s + (k - LEAD) * self._period_s)
+            behind_s = now_s - max(
+                self._start_s, self._start_s + k * self._period_s - self._lead_s
+            )
             self.late += behind_s > self._period_s
             self.worst_late_s = max(self.worst_late_s, behind_s)

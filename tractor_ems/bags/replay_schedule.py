@@ -54,6 +54,16 @@ class Timed:
         """Nothing is left."""
         return self._next is None
 
+    @property
+    def counters(self) -> dict[str, int | float]:
+        """What people want to see."""
+        worst_late_ms = round(1e3 * self.worst_late_s, 1)
+        return {
+            "published": self.published.total(),
+            "late": self.late,
+            "worst_late_ms": worst_late_ms,
+        }
+
     def wait_s(self, now_s: float) -> float:
         """Until the next message is due [s], >= 0."""
         if self._next is None or self._start_s is None:
@@ -113,6 +123,15 @@ class Answered:
     def done(self) -> bool:
         """Nothing is left and the last tick is answered."""
         return self._next is None and self._waiting_ns is None
+
+    @property
+    def counters(self) -> dict[str, int | float]:
+        """What people want to see."""
+        return {
+            "published": self.published.total(),
+            "answered": self.answered,
+            "resent": self.resent,
+        }
 
     def answer(self, command: BatteryPowerCommand) -> None:
         """A command arrived; only a nominal one that echoes the present tick answers it."""

@@ -112,25 +112,16 @@ class TopicPlayer:
             self._poll()
 
     def _counters(self) -> dict[str, object]:
-        schedule = self._schedule
-        own: dict[str, object] = (
-            {"late": schedule.late, "worst_late_ms": round(1e3 * schedule.worst_late_s, 1)}
-            if isinstance(schedule, Timed)
-            else {"answered": schedule.answered, "resent": schedule.resent}
-        )
         return {
-            "published": schedule.published.total(),
+            **self._schedule.counters,
             "topics": len(self._publishers),
-            **own,
             "without_subscriber": self._unheard,
             "skipped": ", ".join(self._skipped) or "none",
         }
 
     def _diagnose(self) -> None:
         state = "playing" if self._first_s is not None else "waiting for a subscriber"
-        bad = bool(self._skipped) or bool(
-            isinstance(self._schedule, Timed) and self._schedule.late
-        )
+        bad = bool(self._skipped or self._schedule.counters.get("late"))
         self._diagnostics.publish(
             diagnostic_array(self._node, state, self._counters(), warning=bad)
         )
