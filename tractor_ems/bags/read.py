@@ -203,7 +203,10 @@ def _contract_connections(path: Path, connections: Sequence[Connection]) -> list
     wanted = [(c, name) for c, ns, name in found if ns in tractors and name in CONTRACT]
     if not wanted:
         held = ", ".join(sorted(c.topic for c in connections)) or "nothing"
-        raise BagError(f"{path}: no topic {topics.POWER_DEMAND.name}, holds {held}")
+        raise BagError(
+            f"{path}: no topic {topics.POWER_DEMAND.name}, holds {held} (other topics need "
+            "--signals; ems bag signals drafts a map)"
+        )
     for connection, name in wanted:
         expected = CONTRACT[name].type
         if connection.msgtype != expected:

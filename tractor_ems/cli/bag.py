@@ -9,9 +9,13 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from tractor_ems.cli.bag_signals import check_signals, signals
 from tractor_ems.cli.output import JsonFlag, print_json, print_table
+from tractor_msgs_py.errors import ConfigError
 
 app = typer.Typer(help="MCAP bags.", no_args_is_help=True)
+
+app.command("signals")(signals)
 
 Bag = Annotated[Path, typer.Argument(help="Bag folder or storage file.")]
 
@@ -40,9 +44,30 @@ def check(
     powertrain: Annotated[
         str | None, typer.Option(help="Name or YAML; default the shipped one of the same hash.")
     ] = None,
+    signals: Annotated[
+        str | None,
+        typer.Option(help="Signal map of a vehicle's bag: name, or YAML file (config/signals*)."),
+    ] = None,
+    namespace: Annotated[
+        str | None, typer.Option(help="Of the map's topics; default the only one that fits.")
+    ] = None,
+    dt: Annotated[
+        float | None,
+        typer.Option(help="With --signals: period [s]; default the powertrain's, or 0.1."),
+    ] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Named checks and a verdict; exit code 0 only for "pass", else 2."""
+    """Named checks and a verdict; exit code 0 only for "pass", else 2.
+
+    With --signals: what is covered of a vehicle's own topics, how often, and whether it is
+    plausible.
+    """
+    if signals is not None:
+        check_signals(bag, signals, namespace, powertrain, dt, json)
+        return
+    for option, value in (("--namespace", namespace), ("--dt", dt)):
+        if value is not None:
+            raise ConfigError(f"{option}: {value}, allowed beside --signals")
     from tractor_ems.bags.check import check as run_checks
     from tractor_sim.config import load_powertrain
 
