@@ -67,6 +67,12 @@ def test_executables_are_those_the_documentation_names():
     assert set(ENTRY_POINTS) == {"ems", *nodes.split()}
 
 
+def test_the_page_on_installing_names_every_executable():
+    page = (ROOT / "docs" / "install.md").read_text()
+    (line,) = re.findall(r"^    bag_player .*$", page, re.MULTILINE)
+    assert set(line.split()) == set(ENTRY_POINTS)
+
+
 @pytest.mark.parametrize("name", sorted(ENTRY_POINTS))
 def test_entry_point_leads_to_a_callable(name):
     module = importlib.import_module(ENTRY_POINTS[name].module)
