@@ -15,9 +15,9 @@ PAST_NS = 60_000_000_000
 CONVINCED_AFTER = 20
 """Samples in a row that disagree with the clock until they, not it, are believed."""
 
-DRIFT = 5e-3
-"""How fast the clocks may drift apart. Quartz is far better; a plant that was held up for 0.1 s and
-does not catch up is followed within 20 s, and between samples 0.1 s apart this is 0.5 ms."""
+WINDOW_NS = 5_000_000_000
+"""The least delayed sample is forgotten after one to two of these, so that a plant that was held
+up, or a clock that was set back a little, is followed [ns]."""
 
 
 @dataclass
@@ -32,13 +32,14 @@ class StampClock:
     scale: float = 1.0
     jumps: int = 0
     _ahead_ns: float | None = None
-    _at_ns: int = 0
+    _ahead_before_ns: float = 0.0
+    _window_ns: int = 0
     _doubts: int = 0
 
     def judge(self, stamp_ns: int, received_ns: int) -> str | None:
         """``future``, ``past`` or None; a sample that is believed may set the clock."""
         ahead_ns = stamp_ns - self.scale * received_ns
-        known_ns = self._ahead_now_ns(received_ns)
+        known_ns = self._known_ns
         if known_ns is None:
             self._set(ahead_ns, received_ns)
             return None
@@ -49,8 +50,7 @@ class StampClock:
             reason = "past"
         if reason is None:
             self._doubts = 0
-            if ahead_ns >= known_ns:
-                self._set(ahead_ns, received_ns)
+            self._note(ahead_ns, received_ns)
             return None
         self._doubts += 1
         if self._doubts < CONVINCED_AFTER:
@@ -61,13 +61,22 @@ class StampClock:
 
     def now_ns(self, received_ns: int) -> int | None:
         """Stamp time at ``received_ns`` of the local clock; None before the first sample."""
-        known_ns = self._ahead_now_ns(received_ns)
+        known_ns = self._known_ns
         return None if known_ns is None else int(known_ns + self.scale * received_ns)
 
-    def _ahead_now_ns(self, received_ns: int) -> float | None:
-        if self._ahead_ns is None:
-            return None
-        return self._ahead_ns - DRIFT * self.scale * max(received_ns - self._at_ns, 0)
+    @property
+    def _known_ns(self) -> float | None:
+        """Stamp minus reception of the least delayed sample of this window and the one before."""
+        return None if self._ahead_ns is None else max(self._ahead_ns, self._ahead_before_ns)
+
+    def _note(self, ahead_ns: float, received_ns: int) -> None:
+        assert self._ahead_ns is not None
+        if received_ns - self._window_ns >= WINDOW_NS:
+            self._ahead_before_ns, self._ahead_ns = self._ahead_ns, ahead_ns
+            self._window_ns = received_ns
+        else:
+            self._ahead_ns = max(self._ahead_ns, ahead_ns)
 
     def _set(self, ahead_ns: float, received_ns: int) -> None:
-        self._ahead_ns, self._at_ns, self._doubts = ahead_ns, received_ns, 0
+        self._ahead_ns = self._ahead_before_ns = ahead_ns
+        self._window_ns, self._doubts = received_ns, 0
