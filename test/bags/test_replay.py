@@ -212,9 +212,9 @@ def test_a_plant_that_never_comes_or_falls_silent_ends_the_replay():
     player.poll(1, 0.0)
     player.poll(1, 100.0)  # it may wait for its policy
     player.observe(tick(0), 100.0)
-    player.poll(1, 105.0)
-    with pytest.raises(RunAborted, match=r"no tick 1 of 5 .* within 5 s, 0 subscribers of"):
-        player.poll(0, 105.1)
+    player.poll(1, 106.0)
+    with pytest.raises(RunAborted, match=r"no tick 1 of 5 .* within 6 s, 0 subscribers of"):
+        player.poll(0, 106.1)
 
 
 # --- topics on time ---------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 Pure and without a clock of its own. ``replay_demand`` decides when which step is published.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,12 +32,14 @@ class DemandTrace:
         cycle: demand without auxiliaries; the run's own cycle to the last bit where the bag
             announces one whose hash its demand has.
         aux_w: auxiliary power that was taken off the record [W].
+        auxiliaries: what is known of it, for people.
         irregular: stamp intervals off by more than 1 % of the step; step k is sample k all the
             same.
     """
 
     cycle: DutyCycle
     aux_w: float
+    auxiliaries: str
     irregular: int = 0
 
     def cut(self, start_s: float, duration_s: float) -> "DemandTrace":
@@ -65,7 +67,7 @@ class DemandTrace:
             operation=whole.operation,
             source=whole.source,
         )
-        return DemandTrace(part, self.aux_w, self.irregular)
+        return replace(self, cycle=part)
 
 
 def demand_of(path: Path, run: int = 0, aux_w: float = ANNOUNCED_AUX_W) -> DemandTrace:
@@ -104,6 +106,8 @@ def demand_of(path: Path, run: int = 0, aux_w: float = ANNOUNCED_AUX_W) -> Deman
     if info is None:
         removed_w = max(aux_w, 0.0)
         demand_w = trace.power_demand_w - removed_w
+        known = aux_w != ANNOUNCED_AUX_W
+        said = f"{removed_w:g} W removed (aux_w)" if known else "unknown, none removed"
     elif aux_w != ANNOUNCED_AUX_W:
         raise ConfigError(
             f"parameter aux_w: {aux_w:g}, but {path} announces auxiliaries of {info.p_aux_w:g} W; "
@@ -112,6 +116,7 @@ def demand_of(path: Path, run: int = 0, aux_w: float = ANNOUNCED_AUX_W) -> Deman
     else:
         removed_w = info.p_aux_w
         demand_w = without_auxiliaries(trace.power_demand_w, info)
+        said = f"{removed_w:g} W removed (announced)"
     cycle = DutyCycle(
         name=trace.cycle or path.stem,
         power_demand_w=demand_w,
@@ -119,7 +124,7 @@ def demand_of(path: Path, run: int = 0, aux_w: float = ANNOUNCED_AUX_W) -> Deman
         operation="bag",
         source=str(path),
     )
-    return DemandTrace(cycle, removed_w, trace.irregular)
+    return DemandTrace(cycle, removed_w, f"auxiliaries {said}", trace.irregular)
 
 
 def without_auxiliaries(recorded_w: FloatArray, announced: RunInfo) -> FloatArray:

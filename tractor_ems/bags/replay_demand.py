@@ -26,7 +26,7 @@ class DemandReplay:
         power_demand_w: (T,), without auxiliaries [W].
         period_s: wall time of one step in real time; 0 is lockstep [s].
         match_timeout_s: how long a plant may take to subscribe, 0 for ever [s].
-        plant_timeout_s: how long the plant may take over one tick, its period excluded [s].
+        plant_timeout_s: how long the plant may take over one tick, beside the step itself [s].
 
     Attributes:
         seen: latest tick that the plant has published; -1 before the first.
@@ -50,7 +50,7 @@ class DemandReplay:
         self._period_s = period_s
         self._lead_s = max(LEAD_PERIODS * period_s, LEAD_S)
         self._match_timeout_s = match_timeout_s
-        self._plant_timeout_s = plant_timeout_s + period_s
+        self._plant_timeout_s = plant_timeout_s + max(period_s, info.dt_s)
         self._since_s: float | None = None
         self._run: RunInfo | None = None
         self._reset()

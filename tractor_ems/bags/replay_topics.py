@@ -99,6 +99,11 @@ def recorded_topics(path: Path, choice: Choice) -> list[RecordedTopic]:
         types = sorted({connection.msgtype for connection in connections})
         if len(types) > 1:
             raise BagError(f"{path}: {name} has several types: {', '.join(types)}")
+        formats = {
+            getattr(connection.ext, "serialization_format", "") for connection in connections
+        }
+        if formats != {"cdr"}:
+            raise BagError(f"{path}: {name} is serialised as {', '.join(formats)}, expected cdr")
         count = sum(connection.msgcount for connection in connections)
         interval_s = long_s / (count - 1) if count > 1 else 0.0
         topics.append(RecordedTopic(name, types[0], _qos_of(connections), count, interval_s))

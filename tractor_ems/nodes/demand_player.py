@@ -66,7 +66,8 @@ class DemandPlayer:
             values["match_timeout_s"],
             values["answer_timeout_s"],
         )
-        self._said = f"{cycle.name}, {trace.aux_w:g} W of auxiliaries removed"
+        uneven = f", {trace.irregular} intervals uneven" if trace.irregular else ""
+        self._said = f"{cycle.name}, {trace.auxiliaries}{uneven}"
         self._demands = publish_on(node, topics.DUTY_CYCLE_DEMAND, QUEUE)
         self._diagnostics = publish_on(node, topics.DIAGNOSTICS)
         # run_info comes first: callbacks that are ready together run in the order of creation.
