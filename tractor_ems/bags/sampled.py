@@ -4,6 +4,7 @@ Messages go through the live node's ObservationBuilder in the order of their rec
 and observations are the live ones. Traces to learn from are made in ``sampled_traces``.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -139,19 +140,21 @@ def wire(
 
 
 def _namespace(bag: AnyBag, wanted: list[Source]) -> str:
-    """The only namespace with all the wanted topics; the root where none has, to say so there."""
-    held = bag.topics
-    relative = [source.topic for source in wanted if not source.topic.startswith("/")]
-    if not relative:
-        return "/"
-    ends = {name.removesuffix(relative[0]) for name in held if name.endswith("/" + relative[0])}
-    fits = sorted(
-        begin for begin in ends if all(full_name(begin, topic) in held for topic in relative)
+    """The only namespace with all the wanted topics; or that with the most, to say there what is
+    missing."""
+    relative = {source.topic for source in wanted if not source.topic.startswith("/")}
+    counts = Counter(
+        name.removesuffix(topic)
+        for topic in relative
+        for name in bag.topics
+        if name.endswith("/" + topic)
     )
+    fits = sorted(begin for begin, count in counts.items() if count == len(relative))
     if len(fits) > 1:
         names = ", ".join(begin.rstrip("/") or "/" for begin in fits)
-        raise BagError(f"{bag.path}: {relative[0]} is in the namespaces {names}, choose one")
-    return (fits[0].rstrip("/") or "/") if fits else "/"
+        raise BagError(f"{bag.path}: {min(relative)} is in the namespaces {names}, choose one")
+    best = max(sorted(counts), key=lambda begin: counts[begin], default="/")
+    return best.rstrip("/") or "/"
 
 
 def _expect(bag: AnyBag, namespace: str, wanted: list[Source]) -> None:
