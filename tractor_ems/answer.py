@@ -159,7 +159,8 @@ class Answerer:
         promised one.
         """
         run = self.run
-        if run is not None and sample.stamp_ns >= run.stamp_ns(run.steps):
+        # Not any later stamp: one from the future must not look like the end and end the watch.
+        if run is not None and sample.stamp_ns == run.stamp_ns(run.steps):
             self._over = True  # the final state: nothing is left to decide
         if self._answer is not None and sample.stamp_ns == self._answer.stamp_ns:
             repeated = isinstance(sample, PowerDemand)  # one answer per resent tick

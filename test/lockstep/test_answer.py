@@ -178,6 +178,17 @@ def test_silence_in_real_time_gives_the_fallback_law_once_per_timeout(make_run):
     assert answerer.fallbacks == 2
 
 
+def test_a_stamp_from_the_future_does_not_end_the_watch(make_run):
+    run = make_run(mode="real_time")
+    answerer = Answerer(RuleBased(run.params), observation_timeout_s=2.0)
+    answerer.start_run(run.info)
+    observe(answerer, run.samples(), now_s=10.0)
+    future_ns = run.info.stamp_ns(run.info.steps) + 1
+    observe(answerer, [replace(s, stamp_ns=future_ns) for s in run.samples()], now_s=11.0)
+    assert answerer.overdue(12.1).mode is CommandMode.FALLBACK
+    assert answerer.shutdown_command().mode is CommandMode.SHUTDOWN
+
+
 def test_lockstep_is_never_answered_by_a_fallback(run, answerer):
     observe(answerer, run.samples(), now_s=0.0)
     assert answerer.overdue(1e9) is None
