@@ -89,7 +89,10 @@ def test_aliases_of_aliases_are_refused_and_plain_ones_are_not():
     assert parse_yaml("[&a {sec: 1}, *a]", "here") == [{"sec": 1}, {"sec": 1}]
 
 
-@pytest.mark.parametrize("text", ["a: 2023-13-01", "[" * 5000, "a: 1" + "0" * 5000])
+@pytest.mark.parametrize(
+    "text",
+    ["a: 2023-13-01", pytest.param("[" * 5000, marks=pytest.mark.slow), "a: 1" + "0" * 5000],
+)
 def test_yaml_that_no_parser_takes_is_one_line(text):
     with pytest.raises(BagError, match=r"^here: ") as caught:
         parse_yaml(text, "here")

@@ -36,7 +36,14 @@ from tractor_msgs_py.types import (
 )
 
 
-@pytest.mark.parametrize("make", [RuleBased, BestPoint, MyopicGreedy, lambda _: Conventional()])
+@pytest.mark.parametrize(
+    "make",
+    [
+        RuleBased,
+        lambda _: Conventional(),
+        *(pytest.param(policy, marks=pytest.mark.slow) for policy in (BestPoint, MyopicGreedy)),
+    ],
+)
 def test_bag_of_a_run_has_the_trajectory_hash_of_the_run(make, tmp_path):
     scenario = make_scenario("paper", "planter_3")
     trajectory = record_in_process(make(scenario.params), scenario, tmp_path / "bag")

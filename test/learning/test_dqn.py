@@ -19,8 +19,6 @@ from tractor_ems.learning.train import train_on
 from tractor_ems.policies.mlp import forward
 from tractor_msgs_py.errors import RunAborted
 
-MODES = pytest.mark.parametrize("double", [True, False], ids=["double", "single"])
-
 
 def transitions(rows: list[tuple[int, int, float, float, int, int, int]], states: int):
     """(state, action, reward, discount, next state, next first, next last), one-hot inputs."""
@@ -74,7 +72,9 @@ def value_iteration(mdp) -> np.ndarray:
     return np.where(feasible, q, np.nan)
 
 
-@MODES
+@pytest.mark.parametrize(
+    "double", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["double", "single"]
+)
 @pytest.mark.parametrize("seed", [3, *(pytest.param(s, marks=pytest.mark.slow) for s in (4, 5))])
 def test_learner_reaches_q_star_of_a_small_mdp_within_1_percent(double: bool, seed: int):
     """Every state has infeasible actions, which are never tried: what the network says of them

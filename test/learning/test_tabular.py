@@ -267,8 +267,15 @@ def test_greedy_episodes_are_repeatable_and_do_not_learn():
     np.testing.assert_array_equal(agent.tables, before)
 
 
-@DOUBLE
-@INTERPOLATE
+@pytest.mark.parametrize(
+    ("interpolate", "double"),
+    [
+        pytest.param(False, False, id="binned-q"),
+        pytest.param(True, True, id="interpolated-double_q"),
+        pytest.param(False, True, id="binned-double_q", marks=SLOW),
+        pytest.param(True, False, id="interpolated-q", marks=SLOW),
+    ],
+)
 def test_the_table_study_equals_brute_force(interpolate: bool, double: bool):
     mdp = process(kind="fuel")
     agent = trained(mdp, 20, double=double, interpolate=interpolate)

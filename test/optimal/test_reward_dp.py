@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from _pytest.mark.structures import ParameterSet
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -37,6 +38,20 @@ def reward_of(kind: RewardKind) -> RewardConfig:
     return RewardConfig(kind=kind, start_price_kg=0.0)
 
 
+def priced_at_both(kinds: tuple[RewardKind, ...]) -> list[ParameterSet]:
+    """Each kind at both SOC_min. The optima of the whole window take longest, and what prices
+    the battery does not come near its lower end: those two are slow."""
+    return [
+        pytest.param(
+            kind,
+            soc_min,
+            marks=[pytest.mark.slow] * (soc_min == 0.70 and kind not in ("fuel", "piecewise")),
+        )
+        for kind in kinds
+        for soc_min in (0.70, 0.836)
+    ]
+
+
 @cache
 def optimum(kind: RewardKind, soc_min: float) -> tuple[float, Trajectory]:
     """Value and roll-out on the paper's cycle."""
@@ -48,8 +63,7 @@ def optimum(kind: RewardKind, soc_min: float) -> tuple[float, Trajectory]:
     return solution.best_return, roll_out_reward(solution, params)
 
 
-@pytest.mark.parametrize("soc_min", [0.70, 0.836])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("kind", "soc_min"), priced_at_both(KINDS))
 def test_the_real_plant_earns_what_the_optimum_promises(kind: RewardKind, soc_min: float):
     value, run = optimum(kind, soc_min)
     earned = reward_sum(run, plant(soc_min), reward_of(kind), 0.836)
@@ -83,8 +97,9 @@ def test_fuel_alone_drains_the_battery_too_but_at_the_best_point(soc_min: float)
     assert figures["efficiency"] == pytest.approx(0.437, rel=5e-3)
 
 
-@pytest.mark.parametrize("soc_min", [0.70, 0.836])
-@pytest.mark.parametrize("kind", ["piecewise_corrected", "equivalent_fuel"])
+@pytest.mark.parametrize(
+    ("kind", "soc_min"), priced_at_both(("piecewise_corrected", "equivalent_fuel"))
+)
 def test_a_reward_that_prices_the_battery_holds_soc_and_keeps_the_fuel_optimum(
     kind: RewardKind, soc_min: float
 ):

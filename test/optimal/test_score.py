@@ -119,7 +119,7 @@ cases = given(
 )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 @cases
 def test_nothing_beats_dp(plant, policy, where, seed):
     check_that_nothing_beats_dp(plant, policy, where, seed)

@@ -141,7 +141,7 @@ def test_soil_returns_at_the_same_place_on_the_way_back():
     assert np.mean(mirrored) > np.mean(straight) + 0.1
 
 
-@pytest.mark.parametrize("duration_s", [1, 37, 43_200])
+@pytest.mark.parametrize("duration_s", [1, 37, pytest.param(43_200, marks=pytest.mark.slow)])
 def test_any_duration_from_one_second_to_half_a_day(duration_s):
     for name in ("chisel_plow", "loader", "road_transport", "mixed_day", "measured_job_a"):
         power = generate(name, 2, duration_s=duration_s).power_demand_w

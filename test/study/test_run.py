@@ -156,9 +156,8 @@ def test_seeds_of_a_run_decide_it_and_names_do_not(tmp_path: Path) -> None:
     assert config_hash(more_seeds, row, 0) == digest, "seed 0 is the same run in a larger study"
 
 
-@pytest.mark.parametrize(
-    ("replay", "kept"), [pytest.param("fifo", 0, marks=pytest.mark.slow), ("kept", 2000)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("replay", "kept"), [("fifo", 0), ("kept", 2000)])
 def test_seeds_are_overwritten_in_a_fifo_and_stay_where_they_are_kept(
     replay: str, kept: int, tmp_path: Path
 ) -> None:
