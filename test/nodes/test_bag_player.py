@@ -263,7 +263,7 @@ def test_topics_in_lockstep_play_the_plant_to_a_policy(graph):
     peer = graph.peer(topics.COMMAND)
     peer.on_sample = answers.append
     graph.policy(Answerer(RuleBased(load_powertrain("paper"))))
-    player = player_on(graph, what="topics", pace="lockstep", bag=str(bag), duration_s=3.0)
+    player = player_on(graph, what="topics", pace="lockstep", bag=str(bag), duration_s=1.0)
     ended(graph, player)
     nominal: dict[int, BatteryPowerCommand] = {}
 
