@@ -20,14 +20,20 @@ from tractor_msgs_py.observation import (
     ObservationSpec,
     SampledTick,
 )
+from tractor_msgs_py.sampling import LAG_S
 from tractor_msgs_py.signals import ENGINE_ON_W, OBSERVED, SignalMap, Source
 from tractor_msgs_py.types import BatteryPowerCommand, Reason, RunInfo
 
 RUN_INFO_S = 1.0
 """How long a vehicle's signals are heard before a run is made up for want of a run_info [s]."""
 
+END_S = 1.0
+"""The first tick after a run comes this soon after one within it, or two ticks later [s]."""
 
-def spec_on(signals: SignalMap, spec: ObservationSpec, dt_s: float) -> ObservationSpec:
+
+def spec_on(
+    signals: SignalMap, spec: ObservationSpec, dt_s: float, lag_s: float = LAG_S
+) -> ObservationSpec:
     """What a policy needs to see on a vehicle.
 
     A policy for sampled signals keeps its own spec. One for equal stamps keeps its filters and
@@ -37,14 +43,15 @@ def spec_on(signals: SignalMap, spec: ObservationSpec, dt_s: float) -> Observati
         signals: the vehicle's.
         spec: the policy's own.
         dt_s: period of a policy without one of its own [s].
+        lag_s: how long its ticks wait for late samples, at most its period [s].
 
     Raises:
         PolicyError: the map asks for a sampling that the policy was not made for.
     """
     if spec.mode == "exact":
-        return ObservationSpec(
-            SAMPLED_SIGNALS, spec.dt_s or dt_s, spec.filters, "sampled", sampling_of(signals)
-        )
+        dt_s, sampling = spec.dt_s or dt_s, sampling_of(signals)
+        lag_s = min(lag_s, dt_s)
+        return ObservationSpec(SAMPLED_SIGNALS, dt_s, spec.filters, "sampled", sampling, lag_s)
     own = {way.signal: way.how for way in spec.sampling}
     for signal in signals.signals:
         how = own.get(signal.name)
@@ -83,6 +90,7 @@ class SampledAnswerer:
         check_run: raises where the policy must not drive a run.
         soc_target: of every run; None: what the run, the map, or the powertrain says.
         time_scale: seconds of stamps per second of the local clock.
+        lag_s: how long a tick waits for late samples, for a policy that does not say [s].
 
     Attributes:
         spec: what the policy sees here.
@@ -104,9 +112,10 @@ class SampledAnswerer:
         check_run: RunCheck | None = None,
         soc_target: float | None = None,
         time_scale: float = 1.0,
+        lag_s: float = LAG_S,
     ) -> None:
         self.policy, self.signals = policy, signals
-        self.spec = spec_on(signals, policy.spec, dt_s)
+        self.spec = spec_on(signals, policy.spec, dt_s, lag_s)
         self.decider = Decider(policy, replace(config, vehicle=True))
         self.soc_target = soc_target
         self.count = SampledCounters()
@@ -243,6 +252,10 @@ class SampledAnswerer:
         """Time has passed: decisions of the ticks that have come by it, oldest first."""
         return self._decided(self._builder.poll(received_ns), received_ns, heard)
 
+    def wait_ns(self, received_ns: int) -> int | None:
+        """How long until :meth:`poll` has the next tick; None before the first sample [ns]."""
+        return self._builder.wait_ns(received_ns)
+
     def _decided(self, ticks: list[SampledTick], received_ns: int, heard: bool) -> list[Decision]:
         decisions = [self._decide(tick, received_ns, heard) for tick in ticks]
         made = [decision for decision in decisions if decision is not None]
@@ -253,7 +266,7 @@ class SampledAnswerer:
         run, frame = self.run, tick.frame
         assert run is not None
         if self._announced is not None and frame.stamp_ns >= run.stamp_ns(run.steps):
-            self._over = True
+            self._end(frame.stamp_ns)
             return None
         if frame.stamp_ns <= self._stamp_ns:  # the vehicle's clock was set back
             self.decider.start(self.dt_s, supervised=True)
@@ -277,6 +290,16 @@ class SampledAnswerer:
         if decision is not None:
             self.decision = decision
         return decision
+
+    def _end(self, stamp_ns: int) -> None:
+        """A tick after the announced run: it is over, unless the clock jumped there from within
+        the run, which is a fault that must not end the watch."""
+        reach_ns = max(2.0 * self.dt_s, END_S) * 1e9
+        if self._over or stamp_ns - self._stamp_ns <= reach_ns:
+            self._over = True
+        else:
+            self.count.blind += 1
+            self.decider.lost()
 
     def _blind(self, now_s: float) -> None:
         reasons = {why for name, why in self.missing.items() if name in OBSERVED}

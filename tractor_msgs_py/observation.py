@@ -312,6 +312,11 @@ class ObservationBuilder:
         frames = [] if self._sampler is None else self._sampler.due(received_ns)
         return [self._tick(frame) for frame in frames]
 
+    def wait_ns(self, received_ns: int) -> int | None:
+        """``sampled``: how long until :meth:`poll` has the next tick, unless samples bring it
+        earlier; None before the first sample [ns]."""
+        return None if self._sampler is None else self._sampler.wait_ns(received_ns)
+
     def _tick(self, frame: Frame) -> SampledTick:
         run, values = self.run, frame.values
         assert run is not None and self.spec.dt_s is not None

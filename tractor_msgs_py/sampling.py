@@ -189,6 +189,14 @@ class Sampler:
                 track.forget(frames[-1].stamp_ns - self._horizon_ns)
         return frames
 
+    def wait_ns(self, received_ns: int) -> int | None:
+        """How long, by the local clock, until the next tick comes without another sample; None
+        before the first sample [ns]."""
+        now_ns = self.clock.now_ns(received_ns)
+        if self._tick_ns is None or now_ns is None:
+            return None
+        return max(int((self._tick_ns + self._lag_ns - now_ns) / self.clock.scale), 0)
+
     def _skip_silence(self, now_ns: int) -> None:
         """Hours without any sample are one count, not an empty frame per tick."""
         assert self._tick_ns is not None

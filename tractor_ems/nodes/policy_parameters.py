@@ -3,6 +3,7 @@
 from tractor_ems.handover import DEFAULT_RAMP_W_PER_S
 from tractor_msgs_py.ros.shell import Parameter
 from tractor_msgs_py.ros.wire import HISTORY_DEPTH
+from tractor_msgs_py.sampling import LAG_S
 
 UNSET = -1.0
 COMMON = (
@@ -28,6 +29,14 @@ COMMON = (
         "signals: decide every, for a policy without a period of its own",
         "s",
         0.001,
+        3600,
+    ),
+    Parameter(
+        "lag_s",
+        LAG_S,
+        "signals: a tick waits for late samples, for a policy that does not say",
+        "s",
+        0,
         3600,
     ),
     Parameter(

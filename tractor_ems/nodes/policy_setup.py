@@ -94,6 +94,7 @@ def answerer_of(setup: PolicySetup, values: Mapping[str, Any]) -> "Answerer | Sa
         made_for,
         soc_target=soc_target_of(values["soc_target"]),
         time_scale=values["time_scale"],
+        lag_s=values["lag_s"],
     )
 
 

@@ -24,8 +24,8 @@ from tractor_msgs_py.topics import Qos, Topic
 ANY_PUBLISHER = Qos("best_effort", depth=200)
 """Deep enough for a topic that floods while the policy thinks."""
 
-POLL_PER_LAG, POLL_S = 2.0, 0.01
-"""Ticks that wait for late samples are looked for twice per lag, at most every POLL_S [s]."""
+LEAST_WAIT_S, LONGEST_WAIT_S = 0.001, 0.5
+"""The timer that brings ticks which no message brings is set anew for each, within these [s]."""
 
 
 def by_topic(signals: SignalMap) -> dict[tuple[str, str], list[Source]]:
@@ -54,7 +54,7 @@ class VehicleNode(DrivingNode):
         history_depth: int,
         papers: Paperwork | None = None,
     ) -> None:
-        self._answerer = answerer
+        self._answerer, self._ticking = answerer, False
         super().__init__(node, answerer, history_depth, papers)
 
     def _listen(self) -> None:
@@ -66,9 +66,8 @@ class VehicleNode(DrivingNode):
                 raise ConfigError(f"{answerer.signals.origin}: topic {name}: {error}") from None
             topic = Topic(name, type_name, ANY_PUBLISHER)
             subscribe_to(node, topic, self._on_message(sources), self.outlet.mismatch, kind)
-        period_s = max(answerer.spec.lag_s / POLL_PER_LAG, POLL_S)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(min(period_s, answerer.dt_s / 2), self._poll, clock=steady)
+        self._polling = node.create_timer(LONGEST_WAIT_S, self._poll, clock=steady)
 
     def _on_message(self, sources: list[Source]) -> Callable[[Any, Any], None]:
         def on_message(msg: Any, info: Any) -> None:
@@ -76,13 +75,25 @@ class VehicleNode(DrivingNode):
             values = values_of(sources, msg, info["source_timestamp"])
             if len(values) < len(sources):
                 self._answerer.refusals["malformed"] += 1
-            self._say(self._answerer.sense(values, now_ns, self._heard()), now_ns)
+            decisions = self._answerer.sense(values, now_ns, self._heard())
+            self._say(decisions, now_ns)
+            if decisions or not self._ticking:
+                self._ticking = self._answerer.run is not None
+                self._await_tick(now_ns)
 
         return on_message
 
     def _poll(self) -> None:
         now_ns = time.monotonic_ns()
         self._say(self._answerer.poll(now_ns, self._heard()), now_ns)
+        self._await_tick(now_ns)
+
+    def _await_tick(self, now_ns: int) -> None:
+        wait_ns = self._answerer.wait_ns(now_ns)
+        wait_s = LONGEST_WAIT_S if wait_ns is None else wait_ns * 1e-9
+        wait_s = min(max(wait_s, LEAST_WAIT_S), LONGEST_WAIT_S)
+        self._polling.timer_period_ns = round(wait_s * 1e9)
+        self._polling.reset()
 
     def _heard(self) -> bool:
         return self._answerer.decider.handover.commanding and self.outlet.listeners() > 0
