@@ -13,17 +13,19 @@ from tractor_ems.bags.transitions import cycle_of_bag, iter_traces
 GOLDEN = Path(__file__).resolve().parents[2] / "bags"
 RUNS = {"dp_planter": "dp", "rule_based_planter": "rule_based"}
 NAMES = (*RUNS, "demand_only")
+FOREIGN = "vehicle_planter"
+"""A bag of other topics, which its signal map reads: test/signals."""
 
 pytestmark = pytest.mark.usefixtures("golden_only")
 
 
 def test_golden_bags_are_these_and_below_one_megabyte():
-    assert {path.name for path in find_bags([GOLDEN])} == set(NAMES)
+    assert {path.name for path in find_bags([GOLDEN])} == {*NAMES, FOREIGN}
     files = [path for path in GOLDEN.rglob("*") if path.is_file()]
     assert sum(path.stat().st_size for path in files) < 1_000_000
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", (*NAMES, FOREIGN))
 def test_readme_says_how_a_golden_bag_was_made(name):
     text = (GOLDEN / "README.md").read_text(encoding="utf-8")
     assert name in text
