@@ -250,7 +250,7 @@ class Decider:
 
     def engage(self) -> str:
         """Begin to drive; what happens, in words. Raises PolicyError where it must not."""
-        if not self._supervised:
+        if self._observation is not None and not self._supervised:
             raise PolicyError("not in lockstep: the plant waits for every answer of one policy")
         if self._observation is None or not self.trust.nominal:
             what = self.trouble or self.complaint or "no observation of a run yet"
