@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import typer
-from measuring import Section, Stage, machine, publish, quantiles, shown, stage
-from scripted import (
+from measuring import Section, machine, publish, quantiles, shown
+from nodes.scripted import (
     OBSERVATION,
     SOC,
     TENTH,
@@ -20,6 +20,7 @@ from scripted import (
     random_demand,
     write_cycle,
 )
+from nodes.stage import Stage, stage
 
 from tractor_msgs_py import topics
 
@@ -44,22 +45,23 @@ def policy_trials(
     reactions, recovered, what = [], [], []
     for trial in range(trials):
         plant.begin()
-        while not plant.commands:  # until the policy has the run
-            plant.drive(on.graph.spin_to, 2, PERIOD_S)
-        plant.drive(on.graph.spin_to, rng.randint(3, 12), PERIOD_S)
+        while not plant.nominal:  # until the policy has the run
+            plant.drive(on.graph.spin_to, 2)
+        plant.drive(on.graph.spin_to, rng.randint(3, 12))
         on.graph.spin_until(lambda: plant.nominal, "an answer to the last tick")
         gone, last_s = STOPPED[trial % len(STOPPED)], plant.said_s
+        before = len(plant.commands)
         on.graph.spin_to(last_s + rng.uniform(0.0, PERIOD_S))
-        while not plant.fallback:
+        while not plant.fell_back(before):
             if gone != OBSERVATION:
                 plant.tick(without=gone)
             on.graph.spin_to(time.monotonic() + PERIOD_S)
-        reactions.append(plant.first_fallback_s() - last_s)
+        reactions.append(plant.fell_back(before)[0][0] - last_s)
         what.append("all" if gone == OBSERVATION else gone[0].__name__)
         ticks = 0
         while not plant.nominal and ticks < 100:
-            plant.tick()
-            on.graph.spin_to(time.monotonic() + PERIOD_S)
+            plant.drive(on.graph.spin_to, 1)
+            on.graph.spin_to(plant.next_s() - 0.01)
             ticks += 1
         recovered.append(ticks)
     code = on.end(node)

@@ -1,32 +1,27 @@
-"""What the measuring scripts beside it share: a stage with real processes, quantiles, and sections
-that become one table on the screen, one JSON file and one place in docs/measured.md."""
+"""What the measuring scripts beside it share: quantiles, the machine, and sections that become
+one table on the screen, one JSON file and one place in docs/measured.md."""
 
 import json
 import os
 import platform
 import shlex
-import signal
 import sys
-import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import domain_coordinator
 import numpy as np
-from conftest import BIN, Graph, Process
 from rich.console import Console
 from rich.table import Table
 
 from tractor_msgs_py.atomic import write_json
 
 ROOT = Path(__file__).resolve().parents[2]
+sys.path.append(str(ROOT / "test"))  # where the tests find `nodes`, and the scripts too
 DATA = ROOT / "docs" / "data" / "measured.json"
-_STARTER = "import sys; from tractor_ems import executables; sys.exit(executables.{name}())"
 
 
 @dataclass(frozen=True)
@@ -45,55 +40,6 @@ class Section:
     rows: list[tuple[str, ...]]
     figures: dict[str, Any]
     notes: list[str] = field(default_factory=list)
-
-
-class Stage:
-    """A ROS domain of its own with a graph in this process and nodes in others."""
-
-    def __init__(self, graph: Graph, folder: Path) -> None:
-        self.graph, self.folder = graph, folder
-        self._started: list[Process] = []
-
-    def start(self, name: str, **parameters: Any) -> Process:
-        """An executable with its parameters; ended with the stage at the latest."""
-        command = [str(BIN / name)]
-        if not (BIN / name).exists():  # an installation that is older than the node
-            command = [sys.executable, "-c", _STARTER.format(name=name)]
-        if parameters:
-            command.append("--ros-args")
-        for key, value in parameters.items():
-            command += ["-p", f"{key}:={value}"]
-        self._started.append(Process(name, command, self.folder))
-        return self._started[-1]
-
-    def end(self, process: Process) -> int:
-        """Terminate and reap; the exit code."""
-        return process.end(signal.SIGTERM) if process.process.poll() is None else process.end()
-
-    def close(self) -> None:
-        """End what is left."""
-        for process in self._started:
-            if process.process.poll() is None:
-                process.end(signal.SIGKILL)
-
-
-@contextmanager
-def stage() -> Iterator[Stage]:
-    """A stage that nobody else on this machine hears."""
-    with domain_coordinator.domain_id() as domain, tempfile.TemporaryDirectory() as folder:
-        os.environ |= {
-            "ROS_DOMAIN_ID": str(domain),
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-            "ROS_LOG_DIR": str(Path(folder) / "ros_log"),
-        }
-        os.environ.pop("ROS_LOCALHOST_ONLY", None)
-        graph = Graph(domain, Path(folder))
-        made = Stage(graph, Path(folder))
-        try:
-            yield made
-        finally:
-            made.close()
-            graph.close()
 
 
 def quantiles(values: Sequence[float], scale: float = 1.0) -> dict[str, float]:
