@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 
 from tractor_ems.answer import Answerer
+from tractor_ems.decide import DecideConfig
+from tractor_ems.latency import Latencies
 from tractor_ems.policies.protocol import ANY_RUN
 from tractor_ems.policies.rules import RuleBased
 from tractor_msgs_py.errors import CycleError, PolicyError, RunAborted
 from tractor_msgs_py.observation import ObservationSpec
-from tractor_msgs_py.types import BatteryPowerCommand, CommandMode, PowerDemand
+from tractor_msgs_py.supervisor import Condition
+from tractor_msgs_py.types import BatteryPowerCommand, CommandMode, PowerDemand, Reason
+from tractor_sim.plant_run import prepare_run
 from tractor_sim.powertrain import Command
 
 
@@ -213,3 +217,84 @@ def test_a_policy_that_joins_late_goes_on_from_there(make_run):
     answerer.start_run(replace(run.info))
     (command,) = observe(answerer, run.samples())
     assert command.stamp_ns == run.info.stamp_ns(3)
+
+
+@pytest.fixture
+def live(make_run):
+    """A real-time run and a policy that has answered its first tick, at 100 s."""
+    run, answerer = make_run(mode="real_time"), Answerer(Counting(), observation_timeout_s=2.0)
+    answerer.start_run(run.info)
+    observe(answerer, run.samples(), now_s=100.0)
+    return run, answerer
+
+
+def test_after_silence_it_takes_three_good_observations_until_the_policy_drives(live):
+    run, answerer = live
+    assert answerer.overdue(102.1).reason is Reason.OBSERVATION_STALE
+    commands = []
+    for second in range(3):
+        run.apply(BatteryPowerCommand(run.stamp_ns, 0.0))
+        commands += observe(answerer, run.samples(), now_s=103.0 + second)
+    assert [command.mode for command in commands] == [1, 1, 0]
+    assert [command.reason for command in commands] == [Reason.RECOVERING] * 2 + [Reason.NONE]
+    assert commands[-1].battery_power_w == 3.0, "every tick went through the policy"
+
+
+def test_what_the_policy_raises_in_real_time_latches_the_fallback_law(make_run):
+    class Stops(Counting):
+        def act(self, observation, state):
+            raise RunAborted("demand differs")
+
+    run, answerer = make_run(mode="real_time"), Answerer(Stops())
+    answerer.start_run(run.info)
+    (command,) = observe(answerer, run.samples())
+    assert (command.mode, command.reason) == (CommandMode.FALLBACK, Reason.FAULT)
+    assert answerer.decider.trust.reason is Reason.POLICY_ERROR
+    assert answerer.decider.trouble == "RunAborted: demand differs"
+    again = make_run(mode="real_time")
+    answerer.start_run(again.info)
+    assert not answerer.decider.trouble, "a new run forgives"
+
+
+def test_a_policy_that_answers_with_no_number_for_long_is_not_trusted_any_more(tmp_path):
+    class Lost(Counting):
+        def act(self, observation, state):
+            return Command(np.array([math.nan]), np.array([math.nan])), state
+
+    cycle = tmp_path / "long.csv"
+    cycle.write_text("time_s,power_demand_w\n" + "".join(f"{k},9e4\n" for k in range(40)))
+    run, answerer = prepare_run("paper", str(cycle), mode="real_time"), Answerer(Lost())
+    answerer.start_run(run.info)
+    modes = []
+    while not run.done:
+        (command,) = observe(answerer, run.samples(), now_s=float(run.k))
+        modes.append(command.mode)
+        run.apply(BatteryPowerCommand(run.stamp_ns, 0.0))
+    assert modes[0] is CommandMode.NOMINAL and modes[-1] is CommandMode.FALLBACK
+    assert answerer.decider.trust.condition is Condition.FAULT
+
+
+def test_an_implausible_observation_is_not_answered(make_run):
+    run = make_run(mode="real_time")
+    answerer = Answerer(RuleBased(run.params), config=DecideConfig(params=run.params))
+    answerer.start_run(run.info)
+    assert observe(answerer, run.samples())
+    run.apply(BatteryPowerCommand(run.stamp_ns, 0.0))
+    demand, battery, state = run.samples()
+    assert not observe(answerer, [demand, replace(battery, soc=0.2), state])
+    assert "it jumped" in answerer.decider.complaint
+
+
+def test_the_soc_target_can_be_moved_and_given_back_to_the_run(run, answerer):
+    answerer.aim(0.75)
+    assert answerer.run.soc_target == 0.75
+    answerer.aim(None)
+    assert answerer.run.soc_target == run.info.soc_target
+
+
+def test_latencies_are_counted_to_within_two_percent():
+    latencies = Latencies(1e-3 * k for k in range(1, 1001))
+    assert latencies.quantile_s(0.5) == pytest.approx(0.5, rel=0.02)
+    assert latencies.quantile_s(0.99) == pytest.approx(0.99, rel=0.02)
+    assert (latencies.count, latencies.max_s) == (1000, 1.0)
+    assert Latencies().quantile_s(0.5) == 0.0
