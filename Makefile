@@ -40,12 +40,13 @@ $(STAMP): setup.py setup.cfg pyproject.toml package.xml requirements.lock
 demo: $(STAMP)
 	$(BIN)/ems demo $(DEMO_ARGS)
 
-# A file of tests stays in one process: its fixtures are made, and its loops compiled, once.
+# A file of tests stays in one process: its fixtures are made, and its loops compiled, once. No two
+# graphs of nodes run at a time (test/conftest.py).
 test: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not slow' $(PYTEST_ARGS)
 
 test-slow: $(STAMP)
-	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m slow $(PYTEST_ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
