@@ -119,8 +119,7 @@ def _in_order(traces: Iterable[Trace]) -> tuple[Trace, ...]:
 
 
 def _refuse_held_out(trace: Trace) -> None:
-    name = held_out_name(trace.power_demand_w, trace.dt_s, trace.cycle_hash, trace.cycle)
-    name = name or _held_out_at_a_finer_step(trace)
+    name = held_out_name_of(trace)
     if name is not None:
         raise BagError(
             f"{trace.bag}: drives {name}, a held-out cycle that training must not see "
@@ -128,20 +127,29 @@ def _refuse_held_out(trace: Trace) -> None:
         )
 
 
-def _held_out_at_a_finer_step(trace: Trace) -> str | None:
-    """A held-out cycle that was recorded several times per second of it, whole and not rounded.
+def held_out_name_of(trace: Trace) -> str | None:
+    """Name of the held-out cycle that a trace drives, as far as that can be known, or None.
 
-    Cycles are listed at steps of 1 s. Which sample is a second's first is not known, nor whether
-    the recording caught the first and the last second.
+    By what its run announced and by what it holds, also where each second of the cycle was
+    recorded several times. Cycles are listed at steps of 1 s: which sample is a second's first is
+    not known, nor whether the recording caught the first and the last second. Part of a cycle, or
+    one with a sensor's noise, is not known.
     """
+    name = held_out_name(trace.power_demand_w, trace.dt_s, trace.cycle_hash, trace.cycle)
+    if name is not None:
+        return name
     per_second = round(1.0 / trace.dt_s)
     if per_second < 2 or abs(per_second * trace.dt_s - 1.0) > 1e-9:
         return None
+    last = len(trace) - 1
     for phase in range(per_second):
-        seconds_w = trace.power_demand_w[phase::per_second]
-        for begin, end in ((0, None), (1, None), (0, -1), (1, -1)):
-            if len(seconds_w) > 3:
-                name = held_out_name(seconds_w[begin:end], 1.0)
+        # Of each second its last sample; of one that is cut at an end what is left of it.
+        ends = list(range(phase, last + 1, per_second))
+        ends += [last] if ends[-1:] != [last] else []
+        for skip, drop in ((0, 0), (1, 0), (0, 1), (1, 1)):
+            seconds_w = trace.power_demand_w[ends[skip : len(ends) - drop]]
+            if len(seconds_w) > 1:
+                name = held_out_name(seconds_w, 1.0)
                 if name is not None:
                     return name
     return None

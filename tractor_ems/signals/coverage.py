@@ -24,6 +24,10 @@ FRESH_ENOUGH = 0.9
 BALANCE_SHARE = 0.1
 """Bus balance that does not close to within this share of the usual demand is a wrong map."""
 
+ACTIVE_SHARE, ENOUGH_TICKS = 0.05, 10
+"""A battery works at a power above this share of the usual demand; of fewer such ticks nothing
+follows."""
+
 SOC_MOVED = 0.002
 """Change of SOC below which nothing follows from it."""
 
@@ -224,9 +228,13 @@ def _balance(ticks: Sequence[SampledTick]) -> list[Finding]:
     if len(demand_w) < 2:
         return []
     usual_w = max(float(np.median(np.abs(demand_w))), 1e3)
+    active = np.abs(battery_w) > ACTIVE_SHARE * usual_w
 
     def off_w(battery_w: FloatArray) -> float:
-        return float(np.median(np.abs(demand_w - battery_w - engine_w)))
+        """Usually, or usually while the battery works, which alone shows its sign."""
+        rest_w = np.abs(demand_w - battery_w - engine_w)
+        working_w = rest_w[active] if active.sum() >= ENOUGH_TICKS else rest_w
+        return float(max(np.median(rest_w), np.median(working_w)))
 
     share, flipped = off_w(battery_w) / usual_w, off_w(-battery_w) / usual_w
     text = f"demand - battery - engine is off by {share:.1%} of the usual demand"
