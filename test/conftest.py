@@ -4,7 +4,12 @@ finds."""
 
 from typing import Any
 
+import hypothesis
 import pytest
+
+# How long an example takes says how busy the machine is, and the first one loads libraries.
+hypothesis.settings.register_profile("timeless", deadline=None)
+hypothesis.settings.load_profile("timeless")
 
 ROS_PROCESSES = (
     "test/bags/test_bag_recorder.py",
