@@ -155,7 +155,8 @@ def test_a_held_out_cycle_is_known_by_its_content_at_ten_times_its_rate(begin, e
     held_out_w = load_cycle("rotary_hoe_2001").power_demand_w
     # Auxiliaries and the rounding of a product of sensors are in it.
     fine_w = np.repeat(held_out_w, 10)[begin:end] * (1.0 + 1e-15) + 4000.0
-    whole = replace(trace, power_demand_w=fine_w, dt_s=0.1)
+    stamps = np.arange(len(fine_w)) * 10**8
+    whole = replace(trace, stamp_ns=stamps, power_demand_w=fine_w, dt_s=0.1)
     assert held_out_name_of(whole) == ("rotary_hoe_2001" if begin < 10 else None)
     assert held_out_name_of(replace(whole, cycle="rotary_hoe_77")) is not None
     assert held_out_name_of(trace) is None
