@@ -70,6 +70,7 @@ def test_every_topic_is_listed_with_its_rate_and_its_numbers(capsys):
     assert all(guess["reason"] for guess in document["candidates"])
 
 
+@pytest.mark.slow
 def test_the_draft_of_a_map_is_the_map_that_was_made_by_hand(capsys, tmp_path):
     draft = tmp_path / "draft.yaml"
     assert run(capsys, "bag", "signals", GOLDEN, "--out", draft)[0] == 0
@@ -98,7 +99,7 @@ def test_a_bag_that_fits_its_map_passes_the_check(capsys):
     [
         ("scale: 0.01\n", "scale: 1\n", "soc", "looks like percent, which needs scale: 0.01"),
         ("sign: -1\n", "sign: 1\n", "power_balance", "sign: -1 in the map"),
-        ("bms/soc_percent", "bms/soc", "soc", "not in the bag: /tractor1/bms/soc"),
+        slow("bms/soc_percent", "bms/soc", "soc", "not in the bag: /tractor1/bms/soc"),
         slow("scale: 1000.0\n", "scale: 1.0\n", "power_balance", "off by"),
         slow("effort[1]", "effort[7]", "engine_power_w", "of genset/state holds effort[7]"),
         slow("max_age_s: 3.0", "max_age_s: 0.2", "soc", "older than its max_age_s"),
@@ -162,6 +163,7 @@ def test_a_held_out_cycle_is_known_by_its_content_at_ten_times_its_rate(begin, e
     assert held_out_name_of(trace) is None
 
 
+@pytest.mark.slow
 def test_a_bag_becomes_a_cycle(capsys, tmp_path):
     out = tmp_path / "cycle.csv"
     code, account = run(capsys, "cycle", "import", GOLDEN, *MAP, "--out", out, "--dt", "0.1")
