@@ -69,7 +69,7 @@ class SampledCounters:
 
     Attributes:
         ticks: that have come.
-        blind: without an observation.
+        blind: without an observation, after the run's first.
         skipped: decided late, together with a newer one, so their command was not published.
     """
 
@@ -274,7 +274,7 @@ class SampledAnswerer:
         self.count.ticks += 1
         self.missing = dict(frame.missing)
         if tick.observation is None:
-            self.count.blind += 1
+            self.count.blind += self.decision is not None
             self._blind(received_ns * 1e-9)
             return None
         fresh, self._used_ns = self._heard_ns > self._used_ns, self._heard_ns
@@ -298,7 +298,7 @@ class SampledAnswerer:
         if self._over or stamp_ns - self._stamp_ns <= reach_ns:
             self._over = True
         else:
-            self.count.blind += 1
+            self.count.blind += self.decision is not None
             self.decider.lost()
 
     def _blind(self, now_s: float) -> None:

@@ -148,7 +148,7 @@ def test_soc_in_percent_is_refused_with_a_hint_and_never_driven(graph, drive, ve
         ),
     )
     node = drive(signals)
-    until(graph, vehicle, lambda: node._answerer.count.blind > 3, "blind ticks")
+    until(graph, vehicle, lambda: node._answerer.count.ticks > 3, "blind ticks")
     values = node._values()
     assert "looks like percent, which needs scale: 0.01" in values["missing_soc"]
     assert node._answerer.decision is None

@@ -16,7 +16,7 @@ from tractor_ems.nodes.policy_setup import Paperwork, PolicySetup, answerer_of, 
 from tractor_msgs_py import topics
 from tractor_msgs_py.codec import decode_battery, decode_power_demand, decode_powertrain
 from tractor_msgs_py.ros.shell import Parameter, run_node
-from tractor_msgs_py.ros.wire import subscribe_to
+from tractor_msgs_py.ros.wire import arrived_ns, subscribe_to
 
 __all__ = ["COMMON", "PolicyNode", "PolicySetup", "run_policy_node"]
 
@@ -68,15 +68,15 @@ class PolicyNode(DrivingNode):
 
     def _on_sample(
         self, topic: topics.Topic, decode: Callable[[Any], Observed]
-    ) -> Callable[[Any], None]:
-        def on_sample(msg: Any) -> None:
+    ) -> Callable[[Any, Any], None]:
+        def on_sample(msg: Any, info: Any) -> None:
             now_ns = time.monotonic_ns()
             sample = self._decoded(topic, decode, msg)
             if sample is None:
                 return
             answerer = self._answerer
             command = answerer.observe(sample, self.outlet.listeners, now_ns * 1e-9)
-            self.outlet.say(command, now_ns)
+            self.outlet.say(command, arrived_ns(info, now_ns))
             self._follow(answerer.decision)
 
         return on_sample

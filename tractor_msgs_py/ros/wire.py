@@ -1,7 +1,8 @@
 """A row of the wire contract as an rclpy publisher or subscription."""
 
 import importlib
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, TypeAlias
 
@@ -25,6 +26,9 @@ HISTORY_DEPTH = Parameter(
     1_000_000,
 )
 
+
+WAIT_MAX_NS = 60_000_000_000
+"""A message has not waited longer than this; the system's clock was set."""
 
 Mismatch: TypeAlias = Callable[[str, str], None]
 """Told of a peer that cannot be heard: topic, and the QoS policy that does not fit."""
@@ -70,6 +74,27 @@ def subscribe_to(
             incompatible_qos=_told(node, topic.name, mismatch)
         ),
     )
+
+
+def arrived_ns(info: Mapping[str, Any], now_ns: int) -> int:
+    """When a message arrived here, by the clock of ``now_ns``, before it waited for its turn."""
+    waited_ns = time.time_ns() - int(info["received_timestamp"])
+    return now_ns - min(max(waited_ns, 0), WAIT_MAX_NS)
+
+
+def waiting(subscription: Subscription, most: int) -> Iterator[tuple[Any, Any]]:
+    """Messages that wait for their turn, each with its info, at most ``most``.
+
+    The executor asks the middleware about every entity of the node before each message, which
+    costs more than the message; this takes a flood's messages ten times as fast. rclpy has no
+    public way.
+    """
+    for _ in range(most):
+        with subscription.handle:
+            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+        if taken is None:
+            return
+        yield taken[0], taken[1]
 
 
 def message_class(type_name: str) -> Any:
