@@ -308,3 +308,31 @@ def test_a_type_that_is_not_standard_is_read_as_the_bag_defines_it(tmp_path):
     )
     (trace,) = iter_sampled_traces([tmp_path / "own.mcap"], load_signal_map(own), 0.1)
     assert trace.power_demand_w[:3].tolist() == [41_500.0, 42_500.0, 43_500.0]
+
+
+def test_a_sqlite3_bag_is_sampled_by_its_log_times(tmp_path):
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    heard = recording(1, 3.0, 0.0, 0.0)
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        kinds = {h.topic: h.type for h in heard}
+        found = {
+            topic: writer.add_connection(f"/{topic}", kind, typestore=typestore())
+            for topic, kind in kinds.items()
+        }
+        for h in heard:
+            writer.write(found[h.topic], h.received_ns, serialize(h.message, h.type))
+    sampled = read_sampled(tmp_path / "bag", VEHICLE, SPEC)
+    # Recorded without delay, which MCAP knows and sqlite3 need not.
+    again = read_sampled(record(tmp_path / "mcap", heard), VEHICLE, SPEC)
+    assert sampled.namespace == "/" and len(known(sampled.runs[0].ticks)) > 20
+    one, other = sampled.runs[0].ticks[15].frame, again.runs[0].ticks[15].frame
+    assert one.stamp_ns == other.stamp_ns and one.values == pytest.approx(other.values, rel=1e-3)
+
+
+def test_a_run_that_is_announced_says_what_it_is(tmp_path):
+    (trace,) = iter_sampled_traces([GOLDEN / "dp_planter"], load_signal_map(), 0.5)
+    (exact,) = iter_traces([GOLDEN / "dp_planter"])
+    assert trace.dt_s == 0.5 and len(trace) == pytest.approx(2 * len(exact), abs=2)
+    for name in ("soc_target", "p_aux_w", "cycle", "cycle_hash", "powertrain_hash", "policy"):
+        assert getattr(trace, name) == getattr(exact, name)
