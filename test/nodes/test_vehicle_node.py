@@ -1,6 +1,7 @@
 """A policy on a vehicle: any topic, in the shadow, engaged by a service, tuned while it runs."""
 
 import json
+import signal
 import time
 from dataclasses import dataclass, replace
 
@@ -42,6 +43,8 @@ DT_S = 0.05
 POWERTRAIN = f"paper:dt_s={DT_S}"
 PARAMS = load_powertrain(POWERTRAIN)
 FLOAT = "std_msgs/msg/Float64"
+LOOSE = {"allow_other_powertrain": True}
+"""The shipped policy knows its powertrain at steps of 1 s."""
 
 
 def source(topic, scale=1.0):
@@ -329,3 +332,35 @@ def test_a_map_that_samples_otherwise_than_the_policy_was_made_for_is_refused():
     signals = replace(BUS, signals=(BUS.signals[0], soc, BUS.signals[2]))
     with pytest.raises(PolicyError, match=r"soc\.how: last, the policy was made for mean"):
         SampledAnswerer(Half(spec=spec), signals, DecideConfig(params=PARAMS))
+
+
+@pytest.mark.slow
+def test_a_shadow_takes_over_from_a_real_incumbent_and_its_log_survives_sigkill(
+    start, graph, wait_for, tmp_path
+):
+    path, log = tmp_path / "work.csv", tmp_path / "shadow.csv"
+    rows = "".join(f"{0.1 * k:.1f},100e3\n" for k in range(20_000))
+    path.write_text("time_s,power_demand_w\n" + rows)
+    vehicle = {"powertrain": "paper:dt_s=0.1"}
+    peer = graph.peer(topics.POWERTRAIN)
+    client = peer.node.create_client(SetBool, "ddqn_policy/enable")
+    shadow = start("ddqn_policy", signals="signals", shadow=True, shadow_log=str(log), **LOOSE)
+    incumbent = start("rule_based_policy", policy="conventional", **vehicle)
+    plant = start("plant_sim", cycle=str(path), mode="real_time", **vehicle)
+
+    def enabled():
+        future = client.call_async(SetBool.Request(data=True))
+        graph.spin_until(future.done, "the service")
+        return future.result().success
+
+    graph.spin_until(lambda: len(peer.heard[topics.POWERTRAIN.name]) > 20, "the incumbent")
+    assert not enabled(), "one policy at a time"
+    assert incumbent.end(signal.SIGTERM) == 0
+    graph.spin_until(enabled, "the hand-over")
+    wait_for(lambda: log.read_text().count("\n") > 20, "the log")
+    assert shadow.end(signal.SIGKILL) != 0
+    lines = [line for line in log.read_text().splitlines() if line[0].isdigit()]
+    stamps = [int(line.split(",")[0]) for line in lines[:-1]]
+    assert stamps == sorted(set(stamps)) and len(stamps) > 10
+    assert plant.end(signal.SIGTERM) == 0
+    assert "Traceback" not in incumbent.output + shadow.output + plant.output

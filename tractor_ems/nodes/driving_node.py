@@ -19,6 +19,7 @@ from tractor_ems.handover import Mode
 from tractor_ems.nodes.enable_service import serve_enable
 from tractor_ems.nodes.policy_setup import Paperwork, changed, soc_target_of
 from tractor_ems.nodes.policy_topics import CommandOutlet
+from tractor_ems.nodes.trust_log import TrustLog
 from tractor_msgs_py import topics
 from tractor_msgs_py.codec import decode_run_info
 from tractor_msgs_py.errors import BagError, TractorEmsError
@@ -42,7 +43,7 @@ class DrivingNode(ABC):
     ) -> None:
         self._node, self._answers, self._papers = node, answers, papers or Paperwork()
         self._followed: Decision | None = None
-        self._told = ""
+        self._trust_log = TrustLog(node)
         self.outlet = CommandOutlet(
             node,
             history_depth,
@@ -94,9 +95,7 @@ class DrivingNode(ABC):
         self.outlet.tidy(now_s)
         if self._papers.log is not None:
             self._papers.log.flush(now_s)
-        if decider.trouble and decider.trouble != self._told:
-            self._node.get_logger().error(f"the policy failed, fallback law: {decider.trouble}")
-        self._told = decider.trouble
+        self._trust_log.tell(decider)
 
     def _pace_watch(self) -> None:
         timeout_s = self._answers.decider.config.timeout_s

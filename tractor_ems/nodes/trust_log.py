@@ -1,0 +1,26 @@
+"""Says in the log what changes in a policy's trust in what it observes, each once."""
+
+from rclpy.node import Node
+
+from tractor_ems.decide import Decider
+from tractor_msgs_py import supervisor
+from tractor_msgs_py.supervisor import Condition
+
+
+class TrustLog:
+    """Remembers what was said."""
+
+    def __init__(self, node: Node) -> None:
+        self._logger = node.get_logger()
+        self._trouble, self._condition = "", Condition.INIT
+
+    def tell(self, decider: Decider) -> None:
+        """What the policy raised, and every change of condition but the first."""
+        if decider.trouble and decider.trouble != self._trouble:
+            self._logger.error(f"the policy failed, fallback law: {decider.trouble}")
+        self._trouble = decider.trouble
+        condition = decider.trust.condition
+        if condition is not self._condition and Condition.INIT not in (condition, self._condition):
+            text = supervisor.describe(decider.trust)
+            self._logger.warning(f"{text}; {decider.complaint}" if decider.complaint else text)
+        self._condition = condition
