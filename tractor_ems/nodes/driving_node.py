@@ -95,7 +95,7 @@ class DrivingNode(ABC):
         self.outlet.tidy(now_s)
         if self._papers.log is not None:
             self._papers.log.flush(now_s)
-        self._trust_log.tell(decider)
+        self._trust_log.tell(decider, getattr(self._answers, "complaints", {}))
 
     def _pace_watch(self) -> None:
         timeout_s = self._answers.decider.config.timeout_s

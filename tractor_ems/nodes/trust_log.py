@@ -1,5 +1,7 @@
 """Says in the log what changes in a policy's trust in what it observes, each once."""
 
+from collections.abc import Mapping
+
 from rclpy.node import Node
 
 from tractor_ems.decide import Decider
@@ -13,9 +15,14 @@ class TrustLog:
     def __init__(self, node: Node) -> None:
         self._logger = node.get_logger()
         self._trouble, self._condition = "", Condition.INIT
+        self._complained: set[str] = set()
 
-    def tell(self, decider: Decider) -> None:
-        """What the policy raised, and every change of condition but the first."""
+    def tell(self, decider: Decider, complaints: Mapping[str, str]) -> None:
+        """What the policy raised, every change of condition but the first, and the first
+        complaint about each signal."""
+        for signal in complaints.keys() - self._complained:
+            self._complained.add(signal)
+            self._logger.error(f"not used: {complaints[signal]}")
         if decider.trouble and decider.trouble != self._trouble:
             self._logger.error(f"the policy failed, fallback law: {decider.trouble}")
         self._trouble = decider.trouble
