@@ -261,7 +261,7 @@ def test_two_tractors_in_one_bag_have_to_be_told_apart(tmp_path):
 def test_soc_in_percent_where_a_fraction_is_mapped_is_refused_with_the_hint(tmp_path):
     path = record(tmp_path / "bag", recording(1, 3.0, 1.0, 0.0))
     wrong = tmp_path / "wrong.yaml"
-    text = Path("config/signals_example_vehicle.yaml").read_text(encoding="utf-8")
+    text = (GOLDEN.parent / "config" / "signals_example_vehicle.yaml").read_text(encoding="utf-8")
     wrong.write_text(text.replace("scale: 0.01\n", "scale: 1.0\n"), encoding="utf-8")
     with pytest.raises(BagError, match=r"soc: .*looks like percent, which needs scale: 0\.01"):
         iter_sampled_traces([path], load_signal_map(wrong), 0.1)
