@@ -18,6 +18,7 @@ from tractor_ems.policies.registry import make_policy
 from tractor_ems.scenario import Scenario, make_scenario
 from tractor_msgs_py.topics import JOINT_STATE, Topic
 from tractor_msgs_py.trajectory import Trajectory
+from tractor_sim.config import load_powertrain
 from tractor_sim.duty_cycle.library import load_cycle
 
 FLOAT64 = "std_msgs/msg/Float64"
@@ -60,7 +61,7 @@ def vehicle_run(
     part_w = listed.power_demand_w[first : None if seconds is None else first + seconds]
     made = make_scenario(powertrain.partition(":")[0], cycle)
     fine = replace(listed, power_demand_w=np.repeat(part_w, 10), dt_s=0.1)
-    params = make_scenario_params(powertrain)
+    params = load_powertrain(powertrain)
     scenario = replace(made, params=params, cycle=fine, powertrain_source=powertrain)
     trajectory = drive(
         make_policy(policy, scenario),
@@ -71,12 +72,6 @@ def vehicle_run(
         t0_ns=EPOCH_NS,
     )[0]
     return scenario, trajectory
-
-
-def make_scenario_params(powertrain: str):
-    from tractor_sim.config import load_powertrain
-
-    return load_powertrain(powertrain)
 
 
 def messages(
