@@ -13,12 +13,13 @@ endif
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test test-slow lint format shipped-policy clean
+.PHONY: help venv demo test test-slow measure lint format shipped-policy clean
 
 help:
 	@echo 'make demo       record experts, learn from their bags, drive the plant: out/demo'
 	@echo 'make test       the tests, without the slow ones'
 	@echo 'make test-slow  the slow ones'
+	@echo 'make measure    the figures of docs/measured.md, 90 minutes on an idle machine'
 	@echo 'make lint       ruff and mypy'
 	@echo 'make format     let ruff format the code'
 	@echo 'make shipped-policy  train the policy that ships, tractor_sim/data/policy'
@@ -47,6 +48,15 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m slow $(PYTEST_ARGS)
+
+# Each writes its section of docs/data/measured.json, from which the page is made.
+measure: $(STAMP)
+	$(BIN)/python test/nodes/measure_reactions.py --trials 50 --record reactions
+	$(BIN)/python test/nodes/measure_faults.py --trials 5 --record faults
+	$(BIN)/python test/nodes/measure_real_time.py --seconds 600 --record real_time
+	$(BIN)/python test/nodes/measure_signals.py --trials 50 --record signals
+	$(BIN)/python test/nodes/measure_handover.py --trials 100 --record handover
+	$(BIN)/python test/nodes/measured_table.py
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

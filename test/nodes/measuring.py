@@ -21,6 +21,7 @@ from tractor_msgs_py.atomic import write_json
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.append(str(ROOT / "test"))  # where the tests find `nodes`, and the scripts too
+WIDTH = 130
 DATA = ROOT / "docs" / "data" / "measured.json"
 
 
@@ -96,7 +97,7 @@ def publish(
         table.add_column(column)
     for row in section.rows:
         table.add_row(*row)
-    console = Console(soft_wrap=True)
+    console = Console(width=WIDTH, soft_wrap=True)
     console.print(table)
     for note in section.notes:
         console.print(note, markup=False)
