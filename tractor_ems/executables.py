@@ -48,6 +48,9 @@ def trainer() -> int:
 def _node(module: str) -> int:
     end_at_once_on_signals()
     code: int = importlib.import_module(module).main()
+    # An interpreter takes 0.3 s to end and would die of a second signal meanwhile.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     return code
 
 
