@@ -21,6 +21,9 @@ WALL = "s wall clock"
 POLL_S = 0.02
 """How often the plant looks whether it is time for something, at the least [s]."""
 
+POLLS_PER_PERIOD, LEAST_POLL_S = 20.0, 0.001
+"""In real time a step ends this part of a period late at most: at 10 Hz by 5 ms."""
+
 MIN_PERIOD_S = 0.005
 """Shortest step in real time that a node in Python keeps up with [s]."""
 
@@ -134,4 +137,4 @@ def pace_of(run: PlantRun, values: Mapping[str, Any]) -> tuple[Pace, float]:
         values["recover_after"],
         values["ramp_w_per_s"],
     )
-    return pace, min(POLL_S, period_s / 2)
+    return pace, max(LEAST_POLL_S, min(POLL_S, period_s / POLLS_PER_PERIOD))
