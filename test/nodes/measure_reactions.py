@@ -148,8 +148,8 @@ def main(
         "one period more than the stale command acted: the longest acted for "
         f"{max(plant['acted_s']):.2f} s of the run.",
         f"The plant needs a timeout of at least {(PERIOD_S + POLL_S) / MARGIN:.2f} s at 10 Hz for "
-        f"this bound, in general {(1.0 + POLL_S / PERIOD_S) / MARGIN:.1f} periods: it reports after the step, "
-        "and looks 20 times a period whether one is over.",
+        f"this bound, in general {(1.0 + POLL_S / PERIOD_S) / MARGIN:.1f} periods: it "
+        "reports after the step, and looks 20 times a period whether one is over.",
     ]
     if policy["exit"] or plant["exit"]:
         notes.insert(0, f"FAILURE: exit codes {policy['exit']} and {plant['exit']}")

@@ -130,7 +130,7 @@ class DrivingNode(ABC):
 
     def shutdown(self) -> None:
         """Leave the safe command behind where a run is under way, then the papers."""
-        self.outlet.say(self._answers.shutdown_command())
+        self.outlet.say_last(self._answers.shutdown_command())
         name = self._node.get_name()
         try:
             if self._papers.log is not None:
