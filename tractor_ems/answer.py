@@ -162,6 +162,7 @@ class Answerer:
         # Not any later stamp: one from the future must not look like the end and end the watch.
         if run is not None and sample.stamp_ns == run.stamp_ns(run.steps):
             self._over = True  # the final state: nothing is left to decide
+            self.decider.clear()
         if self._answer is not None and sample.stamp_ns == self._answer.stamp_ns:
             repeated = isinstance(sample, PowerDemand)  # one answer per resent tick
             return self._if_connected(command_subscribers) if repeated else None

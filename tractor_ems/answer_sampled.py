@@ -297,6 +297,7 @@ class SampledAnswerer:
         reach_ns = max(2.0 * self.dt_s, END_S) * 1e9
         if self._over or stamp_ns - self._stamp_ns <= reach_ns:
             self._over = True
+            self.decider.clear()
         else:
             self.count.blind += self.decision is not None
             self.decider.lost()

@@ -287,6 +287,8 @@ class Decider:
         """The safe command to leave behind; None where this policy does not drive."""
         if self._observation is None or not self.handover.commanding:
             return None
+        if self.config.vehicle:
+            return vehicle_fallback(self._observation, Reason.SHUTDOWN, CommandMode.SHUTDOWN)
         left = fallback_command(self._observation, CommandMode.SHUTDOWN)
         return replace(left, reason=Reason.SHUTDOWN)
 

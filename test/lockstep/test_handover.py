@@ -1,5 +1,6 @@
 """Hand-over: no step in generator power on the way in or out, whoever asks and whenever."""
 
+import contextlib
 import itertools
 import math
 from dataclasses import dataclass, replace
@@ -11,18 +12,20 @@ from hypothesis import strategies as st
 
 from tractor_ems import handover as ho
 from tractor_ems.answer import Answerer
-from tractor_ems.decide import DecideConfig
+from tractor_ems.decide import DecideConfig, Decider
 from tractor_ems.handover import HandoverConfig, HandoverState, Mode
-from tractor_ems.policies.protocol import ANY_RUN
+from tractor_ems.policies.protocol import ANY_RUN, limits_of
 from tractor_ems.safety import vehicle_command
 from tractor_msgs_py.errors import ConfigError, PolicyError
 from tractor_msgs_py.observation import Observation
 from tractor_msgs_py.supervisor import Condition
 from tractor_msgs_py.types import BatteryPowerCommand, CommandMode, Reason
+from tractor_sim.config import load_powertrain
 from tractor_sim.pace import Peers
 from tractor_sim.plant_run import prepare_run
 from tractor_sim.powertrain import Command
 from tractor_sim.real_time import RealTime
+from tractor_sim.safe_command import bounds_w
 
 RAMP = HandoverConfig(ramp_w_per_s=10e3)
 CALM = Peers(1, 1, True, 1)
@@ -341,3 +344,87 @@ def test_shutting_down_while_engaged_leaves_the_safe_command_and_in_the_shadow_n
     left = road.answerer.shutdown_command()
     assert (left.mode, left.reason) == (CommandMode.SHUTDOWN, Reason.SHUTDOWN)
     assert isinstance(left, BatteryPowerCommand) and left.battery_power_w == 0.0
+
+
+def test_engaging_is_refused_once_the_run_is_over(tmp_path):
+    road = Road(np.full(5, 150e3), tmp_path / "cycle.csv")
+    road.tick(5)
+    assert road.plant.run.done
+    road._hear(road.plant.run.closing_samples())
+    with pytest.raises(PolicyError, match="INIT"):
+        road.decider.engage()
+
+
+WILD = st.one_of(
+    st.sampled_from([math.nan, math.inf, -math.inf, 1e308, -1e308, 0.0]), st.floats(-500e3, 500e3)
+)
+
+
+@dataclass
+class Wild:
+    """Answers what it is told to, however absurd; None raises."""
+
+    battery_w: float | None = 0.0
+    engine_power_w: float = 0.0
+    name: str = "wild"
+    spec: object = ANY_RUN
+
+    def init(self, batch):
+        return None
+
+    def act(self, observation, state):
+        if self.battery_w is None:
+            raise ZeroDivisionError("told to")
+        return Command(np.array([self.battery_w]), np.array([self.engine_power_w])), state
+
+
+EVENTS = st.lists(
+    st.tuples(
+        st.sampled_from(["tick"] * 6 + ["engage", "disengage", "silence", "clear"]),
+        WILD,
+        st.one_of(st.none(), WILD),
+        WILD,
+        st.floats(0.0, 1.0),
+    ),
+    max_size=40,
+)
+
+
+def said(decider, what, observation, now_s):
+    """The commands that one event leads to."""
+    if what == "engage":
+        with contextlib.suppress(PolicyError):
+            decider.engage()
+        return []
+    if what == "disengage":
+        return [decider.disengage()[0]]
+    if what == "silence":
+        return [decider.overdue(now_s)]
+    if what == "clear":
+        decider.clear()
+        return []
+    decision = decider.decide(observation, now_s)
+    return [None if decision is None else decision.command]
+
+
+@settings(max_examples=50, deadline=None)
+@given(EVENTS, st.booleans())
+def test_whatever_is_seen_wished_or_asked_for_what_leaves_is_finite_and_feasible(events, always):
+    ramp = replace(RAMP, always=always)
+    config = DecideConfig(handover=ramp, params=load_powertrain("field"), vehicle=True)
+    policy, now_s = Wild(), 0.0
+    decider = Decider(policy, config)
+    decider.start(0.1, supervised=True)
+    for k, (what, demand_w, wished_w, other_w, soc) in enumerate(events, 1):
+        now_s += 3.0 if what == "silence" else 0.1
+        policy.battery_w, policy.engine_power_w = wished_w, other_w
+        observation = seen(demand_w, abs(other_w), k * 10**8, limit_w=abs(other_w))
+        observation = replace(observation, soc=np.array([soc]))
+        for command in (*said(decider, what, observation, now_s), decider.shutdown_command()):
+            if command is None:
+                continue
+            known = decider.observation
+            lb, ub = bounds_w(limits_of(known), known.power_demand_w)
+            assert math.isfinite(command.battery_power_w)
+            assert not math.isinf(command.engine_power_w)
+            assert lb[0] - 1e-6 <= command.battery_power_w <= ub[0] + 1e-6
