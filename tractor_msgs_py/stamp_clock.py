@@ -15,7 +15,7 @@ PAST_NS = 60_000_000_000
 CONVINCED_AFTER = 20
 """Samples in a row that disagree with the clock until they, not it, are believed."""
 
-WINDOW_NS = 5_000_000_000
+WINDOW_NS = 2_000_000_000
 """The least delayed sample is forgotten after one to two of these, so that a plant that was held
 up, or a clock that was set back a little, is followed [ns]."""
 
