@@ -43,6 +43,7 @@ TEST_KEYS = {
     "domain_coordinator": "domain_coordinator",
     "hypothesis": "python3-hypothesis",
     "psutil": "python3-psutil",
+    "_pytest": "python3-pytest",
     "pytest": "python3-pytest",
     "pytest_timeout": "python3-pytest-timeout",  # nobody imports it: pyproject.toml sets it
     "xdist": "python3-pytest-xdist",
