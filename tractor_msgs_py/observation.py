@@ -300,6 +300,8 @@ class ObservationBuilder:
         if self._sampler is None or self.run is None:
             self.refusals["no_run_info"] += 1
             return []
+        if source.per_step:
+            value /= self.run.dt_s
         ticks = self.poll(received_ns)
         jumps = self._sampler.clock.jumps
         self._sampler.add(source, stamp_ns, value, received_ns)

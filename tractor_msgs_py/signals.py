@@ -89,6 +89,7 @@ class Source:
         scale, offset: to the signal's SI unit; finite, scale not 0.
         stamp: ``header`` uses the message's own stamp, ``publish`` the time it was published,
             which is all that an unstamped message has.
+        per_step: the number is per step of the announced run, so its dt_s divides it.
 
     Raises ConfigError where a value is out of range.
     """
@@ -99,6 +100,7 @@ class Source:
     scale: float = 1.0
     offset: float = 0.0
     stamp: Literal["header", "publish"] = "header"
+    per_step: bool = False
 
     def __post_init__(self) -> None:
         parse_path(self.field)

@@ -280,6 +280,17 @@ def test_engine_power_follows_from_the_bus_balance():
     assert observation is not None and observation.engine_power_w[0] == 30e3
 
 
+def test_what_is_per_step_becomes_a_rate_by_the_step_of_the_announced_run():
+    fuel = Source("fuel", FLOAT64, "data", per_step=True)
+    signals = SignalMap("v", (*SIGNALS.signals, MappedSignal("fuel_kg_per_s", ((fuel,),))))
+    built = ObservationBuilder(SPEC, signals)
+    built.start_run(RUN)
+    ticks = []
+    for source, value in ((VOLTAGE, 1.0), (CURRENT, 1.0), (SOC, 0.5), (ENGINE, 0.0), (fuel, 2e-3)):
+        ticks += built.sense(source, 100 * MS, value, 0)
+    assert ticks[0].frame.values["fuel_kg_per_s"] == pytest.approx(2e-3 / RUN.dt_s)
+
+
 def test_a_sampled_spec_survives_a_policy_file():
     spec = ObservationSpec(
         SAMPLED_SIGNALS, 0.1, (), "sampled", (Sampling("soc", "mean", 3.0),), lag_s=0.01

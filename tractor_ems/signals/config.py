@@ -48,6 +48,7 @@ class _Term(_Strict):
     field: Annotated[str, Field(max_length=256)] | None = None
     offset: Number | None = None
     stamp: Literal["header", "publish"] | None = None
+    per_step: bool | None = None
     product: Annotated[list["_Term"], Field(min_length=1, max_length=MAX_SOURCES)] | None = None
     sum: Annotated[list["_Term"], Field(min_length=1, max_length=MAX_SOURCES)] | None = None
     scale: Number = 1.0
@@ -128,7 +129,7 @@ def _terms(where: str, item: _Term) -> Iterator[tuple[Source, ...]]:
     if item.topic is not None:
         yield (_source(where, item),)
         return
-    for key in ("type", "field", "offset", "stamp"):
+    for key in ("type", "field", "offset", "stamp", "per_step"):
         if getattr(item, key) is not None:
             raise ConfigError(f"{where}.{key}: allowed beside topic, not beside {kinds[0]}")
     for term in _sum(where, item) if item.sum is not None else _product(where, item):
@@ -163,7 +164,8 @@ def _source(where: str, item: _Term) -> Source:
     factor = item.scale * item.sign
     stamp = item.stamp or _own_stamp(where, item.type)
     try:
-        return Source(item.topic, item.type, item.field, factor, item.offset or 0.0, stamp)
+        offset, per_step = item.offset or 0.0, item.per_step or False
+        return Source(item.topic, item.type, item.field, factor, offset, stamp, per_step)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
 
