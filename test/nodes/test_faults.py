@@ -3,8 +3,9 @@
 The faults are in faults.py, the reaction times in docs/measured.md; here only behaviour counts.
 """
 
+import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -31,8 +32,8 @@ from tractor_sim.plant_run import prepare_run
 
 pytestmark = pytest.mark.slow
 TIMEOUT_S = 0.4
-PATIENCE_S = 1.2
-"""How long a side that should drive on is watched: three timeouts."""
+PATIENCE_S, LONGEST_S = 1.2, 20.0
+"""How long a side is watched that should drive on, and one that should fall back [s]."""
 
 STEPS = 20_000
 OBSERVATION = (topics.POWER_DEMAND, topics.BATTERY, topics.POWERTRAIN)
@@ -63,15 +64,23 @@ def policy_of(on: Stage, there: str, sampled: bool) -> Process:
     )
 
 
-@pytest.fixture(scope="module", params=["exact", "sampled"])
+@pytest.fixture(scope="module")
 def plant(request, on, work) -> Iterator[ScriptedPlant]:
     """A scripted plant with a real policy that hears it."""
     there = f"/{request.param}"
     policy = policy_of(on, there, request.param == "sampled")
     peer = on.graph.peer(topics.COMMAND, name="scripted_plant", namespace=there)
-    yield ScriptedPlant(peer, work)
+    scripted = ScriptedPlant(peer, work)
+    yield scripted
     assert on.end(policy) == 0, policy.output
     assert "Traceback" not in policy.output
+
+    def last() -> CommandMode:
+        return scripted.commands[-1][1].mode
+
+    on.graph.spin_until(lambda: last() is CommandMode.SHUTDOWN, "what it leaves behind")
+    on.graph.spin(5)
+    assert last() is CommandMode.SHUTDOWN
     on.graph.remove(peer.node)
 
 
@@ -98,23 +107,37 @@ def policy(on, even) -> Iterator[ScriptedPolicy]:
     on.graph.remove(peer.node)
 
 
-def judge(outcome: Outcome, expected: str) -> None:
-    assert outcome.unsafe == 0, outcome
-    assert outcome.recovery_ticks is not None, outcome
-    if expected == "fallback":
-        assert outcome.reaction_s is not None, outcome
-    else:
-        assert outcome.reaction_s is None and outcome.nominal > 0.5, outcome
+TRIES = 3
+"""A busy machine may stop a node for longer than its timeout, which then rightly falls back: a
+side that should drive on must do so in one of three tries."""
 
 
-@pytest.mark.parametrize("fault", POLICY_FAULTS, ids=lambda fault: fault.name)
+def judge(fault: PolicyFault | PlantFault, attempt: Callable[[float], Outcome]) -> Outcome:
+    for _ in range(TRIES if fault.drives_on else 1):
+        outcome = attempt(PATIENCE_S if fault.drives_on else LONGEST_S)
+        assert outcome.unsafe == 0, outcome
+        assert outcome.recovery_ticks is not None, outcome
+        if (outcome.reaction_s is None) == fault.drives_on:
+            return outcome
+    raise AssertionError(f"{fault.expected} was expected: {outcome}")
+
+
+@pytest.mark.parametrize(
+    ("plant", "fault"),
+    [
+        pytest.param(mode, fault, id=f"{mode}: {fault.name}")
+        for mode in ("exact", "sampled")
+        for fault in POLICY_FAULTS
+        if mode == "exact" or fault.name in DIFFERENT_SAMPLED
+    ],
+    indirect=["plant"],
+)
 def test_a_policy_answers_what_it_hears_safely(on, plant, fault: PolicyFault, request):
     sampled = request.node.callspec.params["plant"] == "sampled"
-    if sampled and fault.name not in DIFFERENT_SAMPLED:
-        pytest.skip("the same code as by equal stamps, only slower to age")
-    outcome = try_policy(on.graph, plant, fault, PATIENCE_S if fault.drives_on else 20.0)
-    judge(outcome, fault.expected)
-    if not fault.drives_on:
+    outcome = judge(fault, lambda patience_s: try_policy(on.graph, plant, fault, patience_s))
+    if fault.drives_on:
+        assert outcome.nominal > 0.5, outcome
+    else:
         assert outcome.reason is (fault.reason_sampled if sampled else fault.reason)
 
 
@@ -140,9 +163,7 @@ def test_percent_that_is_mapped_as_a_fraction_never_drives_and_is_told_the_scale
 
 @pytest.mark.parametrize("fault", PLANT_FAULTS, ids=lambda fault: fault.name)
 def test_a_plant_applies_only_what_is_right(on, policy, fault: PlantFault):
-    judge(
-        try_plant(on.graph, policy, fault, PATIENCE_S if fault.drives_on else 20.0), fault.expected
-    )
+    judge(fault, lambda patience_s: try_plant(on.graph, policy, fault, patience_s))
 
 
 def test_a_lost_policy_or_plant_is_noticed_and_its_replacement_drives(on):
@@ -188,3 +209,21 @@ def test_a_peer_with_the_wrong_qos_is_named_and_not_heard(on, even):
         assert on.end(node) == 0, node.output
     for peer in peers:
         on.graph.remove(peer.node)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_more_signals_do_not_kill_a_node_that_is_ending(on, number):
+    there = f"/{number.name.lower()}"
+    node = policy_of(on, there, sampled=False)
+    watcher = on.graph.node("watcher", there)
+    known = watcher.get_node_names_and_namespaces
+    on.graph.spin_until(lambda: ("rule_based_policy", there) in known(), "the policy")
+
+    def ended() -> bool:
+        node.process.send_signal(number)
+        return node.process.poll() is not None
+
+    on.graph.spin_until(ended, "its end")
+    assert node.end() == 0, node.output
+    assert "Traceback" not in node.output
+    on.graph.remove(watcher)
