@@ -2,16 +2,18 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tractor_ems.bags.in_process import write_demand_bag, write_samples_bag
-from tractor_ems.bags.replay import demand_of, without_auxiliaries
+from tractor_ems.bags.replay import demand_of, mapped_demand_of, without_auxiliaries
 from tractor_ems.bags.replay_demand import LEAD_S, RESEND_S, DemandReplay
 from tractor_ems.bags.replay_schedule import Answered, Timed, lockstep_run
 from tractor_ems.bags.replay_topics import Choice, RawMessage, messages_of, recorded_topics
 from tractor_ems.bags.rosbags_messages import RosbagsMessages, serialize
+from tractor_ems.signals.config import load_signal_map
 from tractor_msgs_py import topics
 from tractor_msgs_py.codec import encode
 from tractor_msgs_py.errors import BagError, ConfigError, RunAborted
@@ -23,6 +25,7 @@ from tractor_msgs_py.types import (
     RunInfo,
 )
 from tractor_sim.duty_cycle.cycle import DutyCycle, cycle_hash
+from tractor_sim.duty_cycle.library import load_cycle
 
 POWER_W = np.array([60e3, 150e3, 200e3, 90e3, 20e3])
 INFO = DutyCycleInfo("one", "short", "0" * 64, 10**12, 1.0, len(POWER_W))
@@ -38,6 +41,14 @@ def test_the_demand_of_a_recorded_run_is_its_cycle_to_the_last_bit(bag, driven):
     trace = demand_of(bag)
     assert cycle_hash(trace.cycle) == driven.info.cycle_hash
     assert trace.cycle.name == "part" and trace.aux_w == driven.info.p_aux_w
+
+
+def test_the_demand_of_a_vehicle_is_read_through_its_map():
+    bag = Path(__file__).parents[2] / "bags" / "vehicle_planter"
+    trace = mapped_demand_of(bag, load_signal_map("example_vehicle"), 0.1)
+    driven_w = load_cycle("planter_21").power_demand_w[100:160]
+    assert trace.cycle.dt_s == 0.1 and abs(len(trace.cycle) - 600) < 10
+    assert np.mean(trace.cycle.power_demand_w) == pytest.approx(np.mean(driven_w), rel=0.02)
 
 
 @pytest.mark.parametrize("aux_w", [4000.0, 0.1, 1234.567])

@@ -10,10 +10,12 @@ import numpy as np
 
 from tractor_ems.bags.read import read_bag
 from tractor_ems.bags.runs import Run
+from tractor_ems.bags.sampled_traces import cycle_of_sampled_bag
 from tractor_ems.bags.transitions import demand_traces
 from tractor_ems.cycle_import import demand_messages
 from tractor_msgs_py.errors import BagError, ConfigError
 from tractor_msgs_py.refusal import refusal
+from tractor_msgs_py.signals import SignalMap
 from tractor_msgs_py.topics import POWER_DEMAND
 from tractor_msgs_py.trajectory import FloatArray
 from tractor_msgs_py.types import RunInfo
@@ -125,6 +127,16 @@ def demand_of(path: Path, run: int = 0, aux_w: float = ANNOUNCED_AUX_W) -> Deman
         source=str(path),
     )
     return DemandTrace(cycle, removed_w, f"auxiliaries {said}", trace.irregular)
+
+
+def mapped_demand_of(path: Path, signals: SignalMap, dt_s: float) -> DemandTrace:
+    """The demand of a vehicle's bag through its signal map, every ``dt_s`` [s].
+
+    Raises:
+        BagError: the bag cannot be read or does not fit the map, or demand is missing in between.
+    """
+    cycle = cycle_of_sampled_bag(path, signals, dt_s)
+    return DemandTrace(cycle, signals.p_aux_w, f"demand through {signals.vehicle}'s signal map")
 
 
 def without_auxiliaries(recorded_w: FloatArray, announced: RunInfo) -> FloatArray:

@@ -46,6 +46,8 @@ PARAMETERS = (
         -1,
         2e6,
     ),
+    Parameter("signals", "", "demand: signal map of a vehicle's bag, a name or YAML file"),
+    Parameter("dt_s", 1.0, "demand through signals: step of the plant", "s", 0.001, 60),
     Parameter("topics", [""], "topics: full names to publish, empty for all"),
     Parameter("exclude", [""], "topics: full names to leave out"),
     Parameter(

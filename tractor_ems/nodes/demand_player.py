@@ -14,8 +14,9 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
-from tractor_ems.bags.replay import demand_of
+from tractor_ems.bags.replay import ANNOUNCED_AUX_W, DemandTrace, demand_of, mapped_demand_of
 from tractor_ems.bags.replay_demand import DemandReplay
+from tractor_ems.signals.config import load_signal_map
 from tractor_msgs_py import __version__, topics
 from tractor_msgs_py.codec import decode_power_demand, decode_run_info, encode
 from tractor_msgs_py.errors import BagError, ConfigError, RunAborted
@@ -36,12 +37,22 @@ QUEUE = 5000
 """Ticks that may wait here, and demands for a plant that is busy."""
 
 
+def _trace(values: Mapping[str, Any]) -> DemandTrace:
+    bag, run, aux_w = Path(values["bag"]), values["run"], values["aux_w"]
+    if not values["signals"]:
+        return demand_of(bag, run, aux_w)
+    for name, value, unset in (("run", run, 0), ("aux_w", aux_w, ANNOUNCED_AUX_W)):
+        if value != unset:
+            raise ConfigError(f"parameter {name}: {value:g}, not allowed beside signals")
+    return mapped_demand_of(bag, load_signal_map(values["signals"]), values["dt_s"])
+
+
 class DemandPlayer:
     """Carries samples between the topics and the replay."""
 
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
         self._node, self._factory = node, RosMessages()
-        trace = demand_of(Path(values["bag"]), values["run"], values["aux_w"])
+        trace = _trace(values)
         cycle = trace.cut(values["start_s"], values["duration_s"]).cycle
         period_s = cycle.dt_s / values["rate"] if values["pace"] == "real_time" else 0.0
         if 0.0 < period_s < MIN_PERIOD_S:
