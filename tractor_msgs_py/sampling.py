@@ -156,7 +156,7 @@ class Sampler:
         reason = reason or (None if isfinite(value) else "not_finite")
         if reason is None:
             jumps = self.clock.jumps
-            reason = self.clock.judge(stamp_ns, received_ns)
+            reason = self.clock.judge(stamp_ns, received_ns, source.topic)
             if self.clock.jumps != jumps:  # the vehicle's clock was set: its past is another one
                 self._tracks = {other: _Track() for other in self._sources}
                 self._tick_ns, track = None, self._tracks[source]

@@ -153,6 +153,9 @@ def test_a_bad_sample_is_refused_by_reason_and_changes_nothing(stamp_ms, value, 
     assert [frame.values["power_demand_w"] for frame in made.due(201 * MS)] == [7.0, 7.0]
 
 
+THREE = {"power_demand_w": VOLTAGE, "battery_power_w": CURRENT, "soc": SOC}
+
+
 def test_one_wrong_stamp_does_not_set_the_clock_and_a_clock_that_was_set_is_believed():
     clock = StampClock()
     assert clock.judge(10**12, 0) is None
@@ -161,6 +164,33 @@ def test_one_wrong_stamp_does_not_set_the_clock_and_a_clock_that_was_set_is_beli
     verdicts = [clock.judge(10**15 + k * MS, k * MS) for k in range(CONVINCED_AFTER - 1)]
     assert verdicts[-1] is None and set(verdicts[:-1]) == {"future"}
     assert clock.jumps == 1
+
+
+def test_a_slow_topic_that_is_heard_first_does_not_blind_the_others():
+    made = sampler(one(VOLTAGE), MappedSignal("soc", ((SOC,),)))
+    frames = []
+    for k in range(100):
+        heard_ns = 10**12 + k * DT_NS
+        if k % 10 == 0:
+            made.add(SOC, heard_ns - 10**9, 0.5, heard_ns)
+        made.add(VOLTAGE, heard_ns, 1.0, heard_ns)
+        frames += made.due(heard_ns)
+    assert made.refusals["future"] < CONVINCED_AFTER
+    assert sum(len(frame.values) == 2 for frame in frames[-70:]) == 70
+
+
+def test_one_topic_from_the_future_does_not_outvote_the_rest_by_flooding():
+    made = sampler(*(MappedSignal(name, ((source,),)) for name, source in THREE.items()))
+    frames = []
+    for k in range(100):
+        heard_ns = 10**12 + k * DT_NS
+        made.add(VOLTAGE, heard_ns, 1.0, heard_ns)
+        made.add(CURRENT, heard_ns, 1.0, heard_ns)
+        for j in range(100):
+            made.add(SOC, heard_ns + 3600 * 10**9 + j * MS, 0.5, heard_ns + j * MS)
+        frames += made.due(heard_ns)
+    assert made.clock.jumps == 0
+    assert all(frame.missing == {"soc": "absent"} for frame in frames)
 
 
 def test_the_clock_follows_the_least_delayed_sample():
