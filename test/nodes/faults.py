@@ -236,9 +236,7 @@ def try_policy(graph: Any, plant: ScriptedPlant, fault: PolicyFault, patience_s:
     """A new run, good ticks, the fault until the policy falls back or ``patience_s`` is over,
     then good ticks again."""
     plant.begin()
-    while not plant.nominal:
-        plant.drive(graph.spin_to, 1)
-        graph.spin_to(plant.next_s() - 0.01)
+    plant.drive_until_nominal(graph.spin_to)
     plant.drive(graph.spin_to, 5)
     graph.spin_until(lambda: plant.nominal, "an answer to the last tick")
     last_s, before = plant.said_s, len(plant.commands)
@@ -248,16 +246,15 @@ def try_policy(graph: Any, plant: ScriptedPlant, fault: PolicyFault, patience_s:
         nominal, ticks = nominal + plant.nominal, ticks + 1
         fault.tick(plant)
     fallen = plant.fell_back(before)
-    recovered = 0
-    while recovered == 0 or (not plant.nominal and recovered < 60):
-        plant.drive(graph.spin_to, 1)
-        graph.spin_to(plant.next_s() - 0.01)
-        recovered += 1
+    try:
+        recovered: int | None = plant.drive_until_nominal(graph.spin_to)
+    except AssertionError:
+        recovered = None
     return Outcome(
         fallen[0][0] - last_s if fallen else None,
         fallen[0][1].reason if fallen else Reason.NONE,
         nominal / max(ticks, 1),
-        recovered if plant.nominal else None,
+        recovered,
         plant.unsafe,
     )
 

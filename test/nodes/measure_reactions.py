@@ -46,25 +46,19 @@ def policy_trials(
     reactions, recovered, what = [], [], []
     for trial in range(trials):
         plant.begin()
-        while not plant.nominal:  # until the policy has the run
-            plant.drive(on.graph.spin_to, 2)
+        plant.drive_until_nominal(on.graph.spin_to)
         plant.drive(on.graph.spin_to, rng.randint(3, 12))
         on.graph.spin_until(lambda: plant.nominal, "an answer to the last tick")
         gone, last_s = STOPPED[trial % len(STOPPED)], plant.said_s
         before = len(plant.commands)
         on.graph.spin_to(last_s + rng.uniform(0.0, PERIOD_S))
-        while not plant.fell_back(before):
+        while not plant.fell_back(before) and node.process.poll() is None:
             if gone != OBSERVATION:
                 plant.tick(without=gone)
             on.graph.spin_to(time.monotonic() + PERIOD_S)
         reactions.append(plant.fell_back(before)[0][0] - last_s)
         what.append("all" if gone == OBSERVATION else gone[0].__name__)
-        ticks = 0
-        while not plant.nominal and ticks < 100:
-            plant.drive(on.graph.spin_to, 1)
-            on.graph.spin_to(plant.next_s() - 0.01)
-            ticks += 1
-        recovered.append(ticks)
+        recovered.append(plant.drive_until_nominal(on.graph.spin_to))
     code = on.end(node)
     on.graph.remove(peer.node)
     return {"reaction_s": reactions, "stopped": what, "ticks_to_recover": recovered, "exit": code}

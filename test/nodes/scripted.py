@@ -24,6 +24,9 @@ TENTH = "paper:dt_s=0.1"
 
 SOC = 0.8
 
+MOST_TICKS = 300
+"""Good ticks, half a minute at 10 Hz, after which a policy must have been found and drive."""
+
 OBSERVATION = (PowerDemand, BatteryReading, PowertrainReading)
 
 
@@ -120,6 +123,18 @@ class ScriptedPlant:
         for _ in range(ticks):
             spin_to(self.next_s() if self._begun_s is not None else 0.0)
             self.tick()
+
+    def drive_until_nominal(self, spin_to: Callable[[float], None]) -> int:
+        """Good ticks until the policy drives, at least one; how many.
+
+        Raises AssertionError where it does not within :data:`MOST_TICKS`.
+        """
+        for ticks in range(1, MOST_TICKS + 1):
+            self.drive(spin_to, 1)
+            spin_to(self.next_s() - 0.01)
+            if self.nominal:
+                return ticks
+        raise AssertionError(f"no policy drives after {MOST_TICKS} good ticks")
 
     @property
     def nominal(self) -> bool:
