@@ -124,6 +124,30 @@ class Decider:
         self.handover = replace(self.handover, generator_w=np.nan)
         self.clear()
 
+    def rehearse(self, dt_s: float = 1.0) -> None:
+        """Decide once on a made-up observation and forget it, so that the first tick does not
+        wait for what is loaded on first use (measured: 20-30 ms). A policy that decides on its
+        own run alone may refuse; that is no fault."""
+        half, power_w = np.array([0.5]), np.array([50e3])
+        made_up = Observation(
+            stamp_ns=1,
+            power_demand_w=power_w,
+            soc=half,
+            soc_target=half,
+            engine_on=np.array([False]),
+            time_in_state_s=np.array([60.0]),
+            engine_power_w=np.zeros(1),
+            charge_limit_w=power_w,
+            discharge_limit_w=power_w,
+            engine_limit_w=power_w,
+            features=np.zeros((1, len(self.policy.spec.filters))),
+        )
+        before = self.handover, self.corrected, self.fallbacks, self.reasons.copy()
+        self.start(dt_s, supervised=True)
+        self.decide(made_up, 0.0)
+        self.handover, self.corrected, self.fallbacks, self.reasons = before
+        self.start(dt_s, supervised=False)
+
     def clear(self) -> None:
         """Trust anew, also after FAULT."""
         self.trust = supervisor.reset()

@@ -256,6 +256,29 @@ def test_what_the_policy_raises_in_real_time_latches_the_fallback_law(make_run):
     assert not answerer.decider.trouble, "a new run forgives"
 
 
+@pytest.mark.parametrize("shadow", [False, True])
+def test_a_rehearsal_leaves_no_trace_whatever_the_policy_does(run, shadow):
+    class Odd(Counting):
+        def act(self, observation, state):
+            if observation.stamp_ns == 1:
+                raise RunAborted("not my run")
+            return super().act(observation, state)
+
+    for policy in (Counting(), Odd()):
+        fresh = Answerer(policy, config=DecideConfig(shadow=shadow))
+        rehearsed = Answerer(policy, config=DecideConfig(shadow=shadow))
+        rehearsed.decider.rehearse()
+        assert rehearsed.decider.trust == fresh.decider.trust
+        assert rehearsed.decider.mode is fresh.decider.mode
+        assert rehearsed.counters == fresh.counters and not rehearsed.decider.trouble
+        for answerer in (fresh, rehearsed):
+            answerer.start_run(run.info)
+        said = [str(observe(a, run.samples())) for a in (fresh, rehearsed)]  # NaN equals NaN
+        assert said[0] == said[1]
+        wishes = [a.decision.wish.battery_power_w for a in (fresh, rehearsed)]
+        assert wishes == [0.0, 0.0]
+
+
 def test_a_policy_that_answers_with_no_number_for_long_is_not_trusted_any_more(tmp_path):
     class Lost(Counting):
         def act(self, observation, state):

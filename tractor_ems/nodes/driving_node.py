@@ -43,6 +43,7 @@ class DrivingNode(ABC):
     ) -> None:
         self._node, self._answers, self._papers = node, answers, papers or Paperwork()
         self._followed: Decision | None = None
+        answers.decider.rehearse()
         self._trust_log = TrustLog(node)
         self.outlet = CommandOutlet(
             node,
