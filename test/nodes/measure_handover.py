@@ -62,6 +62,8 @@ class Drive:
 
     def enable(self, wanted: bool) -> Any:
         """Call the service; its answer."""
+        # A service is found before both its topics are, and a call made then gets no answer.
+        self.on.graph.spin_until(self._client.service_is_ready, "the service")
         asked = self._client.call_async(SetBool.Request(data=wanted))
         self.on.graph.spin_until(asked.done, "an answer of the service")
         return asked.result()

@@ -41,6 +41,12 @@ class Stage:
         """Terminate and reap; the exit code."""
         return process.end(signal.SIGTERM) if process.process.poll() is None else process.end()
 
+    def tell(self) -> None:
+        """What became of every node, for whoever looks for what went wrong."""
+        for process in self._started:
+            last = process.output.splitlines()[-3:]
+            print(f"{process.name}: exit code {process.process.poll()}", *last, sep="\n    ")
+
     def close(self) -> None:
         """End what is left."""
         for process in self._started:
@@ -62,6 +68,9 @@ def stage() -> Iterator[Stage]:
         made = Stage(graph, Path(folder))
         try:
             yield made
+        except BaseException:
+            made.tell()
+            raise
         finally:
             made.close()
             graph.close()

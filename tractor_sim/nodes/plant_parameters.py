@@ -21,8 +21,8 @@ WALL = "s wall clock"
 POLL_S = 0.02
 """How often the plant looks whether it is time for something, at the least [s]."""
 
-POLLS_PER_PERIOD, LEAST_POLL_S = 20.0, 0.001
-"""In real time a step ends this part of a period late at most: at 10 Hz by 5 ms."""
+POLLS_PER_PERIOD, LEAST_POLL_S = 10.0, 0.001
+"""In real time a step ends this part of a period late at most: at 10 Hz by 10 ms."""
 
 MIN_PERIOD_S = 0.005
 """Shortest step in real time that a node in Python keeps up with [s]."""
