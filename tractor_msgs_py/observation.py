@@ -24,7 +24,7 @@ from tractor_msgs_py.sampling import (
     Sampling,
     engine_power_w,
 )
-from tractor_msgs_py.signals import ENGINE_ON_W, OBSERVED, SignalMap, Source
+from tractor_msgs_py.signals import ENGINE_ON_W, OBSERVED, VITAL, SignalMap, Source
 from tractor_msgs_py.trajectory import BoolArray, FloatArray
 from tractor_msgs_py.types import (
     BatteryReading,
@@ -322,7 +322,7 @@ class ObservationBuilder:
     def _tick(self, frame: Frame) -> SampledTick:
         run, values = self.run, frame.values
         assert run is not None and self.spec.dt_s is not None
-        blind = [name for name in frame.missing if name in OBSERVED]
+        blind = [n for n in OBSERVED if n in frame.missing or (n in VITAL and n not in values)]
         engine_w = engine_power_w(values)
         if blind or engine_w is None:
             for name in blind or ["engine_power_w"]:

@@ -71,6 +71,9 @@ SIGNALS: dict[str, Definition] = {
 OBSERVED = tuple(SIGNALS)[:8]
 """Signals that a policy can observe."""
 
+VITAL = ("power_demand_w", "soc")
+"""Observed signals that nothing can stand in for."""
+
 ENGINE_ON_W = 1000.0
 """Without a signal ``engine_on`` an engine that gives more than this at the bus is on [W]."""
 
