@@ -6,7 +6,7 @@ import pytest
 
 from tractor_ems.bags.rosbags_messages import has_header
 from tractor_ems.signals.config import load_signal_map, optional_map
-from tractor_ems.signals.vehicle import sampled_spec, values_of
+from tractor_ems.signals.vehicle import sampled_spec, values_of, vehicle_run
 from tractor_msgs_py.errors import ConfigError
 from tractor_msgs_py.observation import ObservationBuilder
 from tractor_msgs_py.sampling import Sampler
@@ -130,6 +130,23 @@ def test_what_is_wrong_with_a_map_is_said_in_one_line(load, signals, says):
 def test_the_head_of_a_map_is_checked(load, head, says):
     with pytest.raises(ConfigError, match=says):
         load(f"  soc: {{topic: s, {FLOAT}}}", head)
+
+
+def test_a_signal_that_is_mapped_twice_is_refused_where_yaml_keeps_the_last(load):
+    one = f"  soc: {{topic: a, {FLOAT}}}\n"
+    with pytest.raises(ConfigError, match=r"map\.yaml: .*soc stands twice"):
+        load(one + one)
+
+
+def test_a_vehicle_without_soc_is_no_observation_and_no_error(load):
+    signals = load(
+        f"  power_demand_w: {{topic: a, {FLOAT}}}\n  engine_power_w: {{topic: b, {FLOAT}}}"
+    )
+    spec = sampled_spec(signals, 0.01, needed=("power_demand_w",))
+    built = ObservationBuilder(spec, signals)
+    built.start_run(vehicle_run(0.01, 0.5))
+    ticks = [tick for s in signals.sources for tick in built.sense(s, 10**9, 5.0, 10**9)]
+    assert ticks[0].observation is None and built.refusals == {"absent_soc": 1}
 
 
 def test_a_map_that_is_not_there_is_named_with_those_that_are():

@@ -67,7 +67,12 @@ class SampledBag:
     @property
     def refused_samples(self) -> int:
         """Samples that were not used."""
-        return sum(n for reason, n in self.refusals.items() if not reason.startswith(TICKS))
+        return sum(self.refused_by_reason.values())
+
+    @property
+    def refused_by_reason(self) -> dict[str, int]:
+        """The same by reason."""
+        return {r: n for r, n in self.refusals.items() if not r.startswith(TICKS)}
 
 
 @dataclass(frozen=True)
@@ -117,6 +122,7 @@ def wire(
     wanted = [source for signal in signals.of(needed) for source in signal.sources]
     if namespace is None:
         namespace = _namespace(bag, wanted)
+    namespace = f"/{namespace.strip('/')}"
     _expect(bag, namespace, wanted)
     wiring: dict[str, tuple[Source, ...]] = {}
     absent: dict[str, tuple[str, ...]] = {}

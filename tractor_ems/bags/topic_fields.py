@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from tractor_ems.bags.any_messages import AnyBag
+from tractor_msgs_py.codec import stamp_to_ns
 from tractor_msgs_py.errors import BagError
 from tractor_msgs_py.trajectory import FloatArray
 
@@ -90,7 +91,8 @@ def rhythm_of(stamps_ns: list[int]) -> Rhythm:
 
 @dataclass
 class TopicFields:
-    """One topic: what it is, how often it comes, and the numbers in it by field path."""
+    """One topic: what it is, how often it comes, and the numbers in it by field path; ``stamped``
+    where its headers say a time."""
 
     name: str
     type: str
@@ -131,8 +133,7 @@ def topic_fields(path: Path) -> list[TopicFields]:
         topic.publish_ns.append(heard.publish_ns)
         if heard.message is None or len(topic.publish_ns) > MAX_MESSAGES:
             continue
-        if hasattr(heard.message, "header"):
-            topic.stamped = True
+        topic.stamped = topic.stamped or _stamped(heard.message)
         for number, (place, value) in enumerate(numbers_in(heard.message)):
             if number == MAX_FIELDS:
                 break
@@ -140,6 +141,14 @@ def topic_fields(path: Path) -> list[TopicFields]:
     if not any(topic.publish_ns for topic in found.values()):
         raise BagError(f"{path}: holds no message that can be read")
     return [found[name] for name in sorted(found)]
+
+
+def _stamped(message: Any) -> bool:
+    """It says when it was true; a stamp of 0 is one that nobody has filled in."""
+    try:
+        return stamp_to_ns(message.header.stamp) > 0
+    except (AttributeError, BagError):
+        return False
 
 
 def numbers_in(message: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, float]]:
@@ -159,8 +168,9 @@ def numbers_in(message: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple
         elif dataclasses.is_dataclass(value):
             yield from numbers_in(value, f"{place}.", depth + 1)
         elif isinstance(value, list | np.ndarray):
-            labels = names if len(names) == len(value) else [str(k) for k in range(len(value))]
-            for label, entry in zip(labels[:MAX_FIELDS], value, strict=False):
+            count = min(len(value), MAX_FIELDS)
+            labels = names if len(names) == len(value) else [str(k) for k in range(count)]
+            for label, entry in zip(labels[:count], value, strict=False):
                 if isinstance(entry, bool | int | float | np.generic):
                     yield f"{place}[{label}]", float(entry)
                 elif dataclasses.is_dataclass(entry):

@@ -59,10 +59,10 @@ def signals(
             }
         )
         return
-    rows = [(t.name, t.type, *asdict(t.rhythm).values()) for t in found]
+    rows = [(_printable(t.name), _printable(t.type), *asdict(t.rhythm).values()) for t in found]
     print_table("topics", ("topic", "type", "messages", "Hz", "jitter s", "gap s"), rows)
     numbers = [
-        (escape(f"{topic.name} {path}"), *list(item.to_json().values())[1:4])
+        (_printable(f"{topic.name} {path}"), *list(item.to_json().values())[1:4])
         for topic in found
         for path, item in topic.fields.items()
     ]
@@ -81,7 +81,12 @@ def signals(
 
 
 def _shown(place: "Place") -> str:
-    return escape(f"{place.topic} {place.field}")
+    return _printable(f"{place.topic} {place.field}")
+
+
+def _printable(name: str) -> str:
+    """A name from a bag, which can hold anything, as text for a table."""
+    return escape("".join(c if c.isprintable() else "?" for c in name))
 
 
 def check_signals(
@@ -99,7 +104,8 @@ def check_signals(
     from tractor_sim.config import load_powertrain
 
     params = None if powertrain is None else load_powertrain(powertrain)
-    dt_s = dt_s or (DEFAULT_DT_S if params is None else params.dt_s)
+    if dt_s is None:
+        dt_s = DEFAULT_DT_S if params is None else params.dt_s
     if not 1e-3 <= dt_s <= 3600.0:
         raise ConfigError(f"--dt: {dt_s}, allowed 0.001..3600")
     report = check_coverage(

@@ -11,6 +11,7 @@ from itertools import product
 from typing import Any
 
 from tractor_ems.bags.topic_fields import FieldRange, TopicFields
+from tractor_ems.signals.config import NAME, TYPE
 
 WORDS = {
     "battery": r"batt(ery)?|bms|pack|accu|ess|cell",
@@ -81,11 +82,17 @@ def candidates(topics: Iterable[TopicFields]) -> list[Candidate]:
         Place(topic.name, topic.type, path, item, _words(f"{topic.name}/{path}"))
         for topic in topics
         for path, item in topic.fields.items()
-        if item.count and not _CONSTANT.search(path)
+        if item.count and not _CONSTANT.search(path) and _mappable(topic, path)
     ]
     found = [*_direct(places), *_products(places)]
     order = {name: k for k, name in enumerate(dict.fromkeys(c.signal for c in found))}
     return sorted(found, key=lambda c: (order[c.signal], -c.score, c.factors[0].topic))
+
+
+def _mappable(topic: TopicFields, path: str) -> bool:
+    """What a map can name: foreign bags hold any text as names."""
+    known = re.fullmatch(NAME, topic.name) and re.fullmatch(TYPE, topic.type)
+    return bool(known) and path.isprintable()
 
 
 def _words(text: str) -> frozenset[str]:

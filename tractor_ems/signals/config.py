@@ -23,8 +23,8 @@ DEFAULT = "signals"
 MAX_SOURCES = 16
 """Terms of a sum, and factors of a product."""
 
-_NAME = r"^/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*$"
-_TYPE = r"^[a-z][a-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*$"
+NAME = r"^/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*$"
+TYPE = r"^[a-z][a-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*$"
 
 
 def _no_flag(value: Any) -> Any:
@@ -43,8 +43,8 @@ class _Strict(BaseModel):
 class _Term(_Strict):
     """A source (topic, type, field), a product or a sum; each with a factor of its own."""
 
-    topic: Annotated[str, Field(max_length=256, pattern=_NAME)] | None = None
-    type: Annotated[str, Field(max_length=256, pattern=_TYPE)] | None = None
+    topic: Annotated[str, Field(max_length=256, pattern=NAME)] | None = None
+    type: Annotated[str, Field(max_length=256, pattern=TYPE)] | None = None
     field: Annotated[str, Field(max_length=256)] | None = None
     offset: Number | None = None
     stamp: Literal["header", "publish"] | None = None

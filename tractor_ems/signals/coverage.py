@@ -115,6 +115,7 @@ def check_coverage(
     reports = tuple(_report(signal, wiring, stamps, sampled, ticks) for signal in signals.signals)
     findings = [
         *_needed(signals),
+        *_used(sampled, ticks),
         *_balance(ticks),
         *([] if params is None else _soc_follows_power(ticks, dt_s, params)),
     ]
@@ -195,7 +196,9 @@ def _judge(
     wrong = sum(tick.frame.missing.get(name) == "implausible" for tick in ticks)
     if wrong:
         return "fail", f"{sampled.complaints.get(name, '')} ({wrong} of {len(ticks)} ticks)"
-    if fresh is None or fresh < FRESH_ENOUGH:
+    if fresh is None:
+        return vital, "never known: no sample of it could be used"
+    if fresh < FRESH_ENOUGH:
         stale = sum(tick.frame.missing.get(name) == "stale" for tick in ticks)
         return vital, f"older than its max_age_s at {stale} of {len(ticks)} ticks"
     return "pass", ""
@@ -212,6 +215,23 @@ def _needed(signals: SignalMap) -> list[Finding]:
         return [Finding("policy_signals", "pass", "all that a policy needs to drive is mapped")]
     text = f"not mapped: {', '.join(lacking)}; enough to learn from, not to drive"
     return [Finding("policy_signals", "warn", text)]
+
+
+def _used(sampled: SampledBag, ticks: Sequence[SampledTick]) -> list[Finding]:
+    """How much of the bag came to nothing."""
+    findings = []
+    known = sum("power_demand_w" in tick.frame.values for tick in ticks)
+    if known < 2:
+        text = f"power_demand_w is known at {known} ticks, allowed from 2"
+        findings.append(Finding("ticks", "fail", text))
+    if silent := sampled.refusals.get("silent_ticks", 0):
+        text = f"all topics are silent for {silent} more ticks, where traces end"
+        findings.append(Finding("silence", "warn", text))
+    if sampled.refused_samples:
+        counts = sampled.refused_by_reason.items()
+        text = "not used: " + ", ".join(f"{reason} {count}" for reason, count in counts)
+        findings.append(Finding("samples", "warn", text))
+    return findings
 
 
 def _paired(ticks: Sequence[SampledTick], *names: str) -> list[FloatArray]:

@@ -8,7 +8,7 @@ from typing import Any
 from tractor_msgs_py.codec import MAX_STEPS, stamp_to_ns
 from tractor_msgs_py.errors import BagError
 from tractor_msgs_py.observation import SAMPLED_SIGNALS, DemandFilter, ObservationSpec
-from tractor_msgs_py.sampling import Sampling
+from tractor_msgs_py.sampling import LAG_S, Sampling
 from tractor_msgs_py.signals import SIGNALS, SignalMap, Source
 from tractor_msgs_py.types import RunInfo
 
@@ -62,6 +62,7 @@ def sampled_spec(
         filters=filters,
         mode="sampled",
         sampling=sampling_of(signals),
+        lag_s=min(LAG_S, dt_s),
     )
 
 
