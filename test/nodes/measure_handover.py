@@ -68,6 +68,21 @@ class Drive:
         self.on.graph.spin_until(asked.done, "an answer of the service")
         return asked.result()
 
+    def worst(self) -> list[str]:
+        """Every step beyond the ramp, with what the policy had said last."""
+        stamps, period_ns = sorted(self.powers_w), round(PERIOD_S * 1e9)
+        told = []
+        for a, b in pairwise(stamps):
+            step_w = self.powers_w[b] - self.powers_w[a]
+            if b - a != period_ns or abs(step_w) <= RAMP_W_PER_S * PERIOD_S + TOLERANCE_W:
+                continue
+            said = [command for command in self.commands if command.stamp_ns <= a]
+            last = max(said, key=lambda command: command.stamp_ns, default=None)
+            what = "nothing" if last is None else f"{last.mode.name}, {last.reason.name}"
+            age_s = 0.0 if last is None else (a - last.stamp_ns) * 1e-9
+            told.append(f"{step_w * 1e-3:+.3f} kW, {age_s:.1f} s after the policy said {what}")
+        return told
+
     def steps_w(self) -> list[float]:
         """Every change of generator power from one step to the next [W]."""
         stamps = sorted(self.powers_w)
@@ -100,11 +115,14 @@ def hand_over(mode: str, trials: int, rng: random.Random) -> dict[str, Any]:
                 left += not wanted and drive.power_w == DEMAND_W
         codes = [on.end(drive.policy), on.end(drive.plant)]
         modes = [command.mode for command in drive.commands]
-        assert codes == [0, 0], drive.policy.output + drive.plant.output
+        policy_said = drive.policy.output
+        assert codes == [0, 0], policy_said + drive.plant.output
     return {
         "steps_w": quantiles(drive.steps_w()),
         "ticks": len(drive.powers_w),
-        "beyond": sum(step > RAMP_W_PER_S * PERIOD_S + TOLERANCE_W for step in drive.steps_w()),
+        "beyond": len(drive.worst()),
+        "worst": drive.worst(),
+        "policy_said": policy_said.splitlines()[-20:],
         "calls": 2 * trials,
         "refused": refused,
         "in_mid_ramp": between,
@@ -137,7 +155,7 @@ def main(
     found = {mode: hand_over(mode, trials, rng) for mode in MODES}
     notes = [
         f"BEYOND THE RAMP, {mode}: {f['beyond']} of {f['ticks']} ticks, worst "
-        f"{f['steps_w']['max'] * 1e-3:.3f} kW"
+        f"{f['steps_w']['max'] * 1e-3:.3f} kW: {'; '.join(f['worst'])}"
         for mode, f in found.items()
         if f["beyond"]
     ]
