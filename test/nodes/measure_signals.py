@@ -216,9 +216,10 @@ def main(
     handlers_s: list[float] = []
     for name in NODES if not only else (only,):
         with stage() as on:
-            cycle = write_cycle(
-                on.folder / "work.csv", [90e3 + 100.0 * k for k in range(STEPS)], 1
-            )
+            # A plant of its own must not come to its end; one for dp_policy must be solved.
+            steps = STEPS * (LONG if name == "plant_sim" else 1)
+            demand_w = [90e3 + 100.0 * (k % STEPS) for k in range(steps)]
+            cycle = write_cycle(on.folder / "work.csv", demand_w, 1.0)
             life = Life(on, name, cycle, rng)
             ask: Callable[[int], End] = life.live
             for signal_name, number in SIGNALS.items():
