@@ -268,8 +268,8 @@ class SampledAnswerer:
         if self._announced is not None and frame.stamp_ns >= run.stamp_ns(run.steps):
             self._end(frame.stamp_ns)
             return None
-        if frame.stamp_ns <= self._stamp_ns:  # the vehicle's clock was set back
-            self.decider.start(self.dt_s, supervised=True)
+        if frame.stamp_ns <= self._stamp_ns:
+            self.decider.set_back()
         self._stamp_ns = frame.stamp_ns
         self.count.ticks += 1
         self.missing = dict(frame.missing)

@@ -153,6 +153,12 @@ class Decider:
         self.trust = supervisor.reset()
         self.complaint = self.trouble = ""
 
+    def set_back(self) -> None:
+        """The vehicle's clock was set back: nothing that was remembered is of this time, and
+        trust must be earned again. FAULT stays, and so does who drives."""
+        self._memory, self._seen = self.policy.init(1), Seen()
+        self.trust = supervisor.lost(self.trust, Reason.OBSERVATION_STALE)
+
     @property
     def mode(self) -> Mode:
         """Where the hand-over is."""
@@ -210,6 +216,8 @@ class Decider:
         else:
             made = vehicle_command if self.config.vehicle else safe_command
             wish, corrected = made(observation, command)
+            if not np.isfinite(command.battery_power_w).all():
+                wish = replace(wish, reason=Reason.POLICY_ERROR)  # the fallback law instead of it
         self.corrected += corrected
         self.handover, sent = ho.hand_over(
             self.config.handover, self.handover, observation, wish, self._dt_s, heard

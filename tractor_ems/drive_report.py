@@ -81,23 +81,29 @@ def values_of(
         **answers.counters,
         **{f"latency_{key}": value for key, value in latencies.summary.items()},
     }
-    values |= {f"missing_{name}": complaints.get(name, why) for name, why in missing.items()}
+    for name, why in missing.items():
+        values[f"missing_{name}"] = complaints.get(name, why) if why == "implausible" else why
     values |= {f"qos_{topic}": f"a peer's {policy}" for topic, policy in mismatches.items()}
     for name, text in (("implausible", decider.complaint), ("policy_error", decider.trouble)):
         if text:
             values[name] = text
     if log is not None:
         values["shadow_log"] = log.sum.line
+        if log.trouble:
+            values["shadow_log_error"] = log.trouble
     return values
 
 
-def warns(answers: Answers, mismatches: Mapping[str, str], others: int) -> bool:
+def warns(
+    answers: Answers, mismatches: Mapping[str, str], log: ShadowLog | None, others: int
+) -> bool:
     """True where somebody should look."""
     decider = answers.decider
     trusted = decider.trust.condition in (Condition.INIT, Condition.NOMINAL)
     doubled = others > 0 and decider.handover.commanding
     spoken = decider.corrected > 0 or decider.fallbacks > 0
-    return doubled or spoken or bool(mismatches) or not trusted
+    lacking = bool(getattr(answers, "missing", {})) or (log is not None and log.trouble != "")
+    return doubled or spoken or lacking or bool(mismatches) or not trusted
 
 
 def line_of(answers: Answers, latencies: Latencies, log: ShadowLog | None) -> str:

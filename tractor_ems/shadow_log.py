@@ -5,7 +5,7 @@ battery energy the policy's command and the applied power would take over that s
 second drive: the policy never gets to the states where its own commands would have led.
 """
 
-import csv
+import contextlib
 import math
 import os
 from collections.abc import Mapping
@@ -166,7 +166,12 @@ class ShadowLog:
         path: CSV file to write, None for the totals alone; an old one is replaced.
         about: what the header says beside the price: policy, map, powertrain ...
 
-    Raises ConfigError where the file cannot be written.
+    Attributes:
+        sum: the totals.
+        trouble: why the file ends early, such as a full disk; empty while it does not. The
+            totals go on: who drives must not stop for a log.
+
+    Raises ConfigError where the file cannot be written to begin with.
     """
 
     def __init__(
@@ -184,13 +189,12 @@ class ShadowLog:
         self._waiting: tuple[Observation, BatteryPowerCommand] | None = None
         self._policy_on: bool | None = None
         self._flushed_s = 0.0
+        self.trouble = ""
         self._file: IO[str] | None = None
         if path is not None:
-            self._file = _opened(path)
-            self._file.writelines(f"# {key}: {value}\n" for key, value in self.about.items())
-            self._rows = csv.writer(self._file, lineterminator="\n")
-            self._rows.writerow(COLUMNS)
-            self._file.flush()
+            self._file = _opened(
+                path, [f"# {key}: {value}\n" for key, value in self.about.items()]
+            )
 
     def tick(self, observation: Observation, wish: BatteryPowerCommand, applied: Applied) -> None:
         """A decision of the policy, and what was applied over the step that it ends.
@@ -251,30 +255,54 @@ class ShadowLog:
             equivalent_kg,
         )
         measured = repr(applied.fuel_kg) if math.isfinite(applied.fuel_kg) else ""
-        self._rows.writerow((before.stamp_ns, *(repr(float(v)) for v in values), measured))
+        row = (str(before.stamp_ns), *(repr(float(value)) for value in values), measured)
+        try:
+            self._file.write(",".join(row) + "\n")
+        except OSError as error:
+            self._give_up(error)
 
     def flush(self, now_s: float) -> None:
         """Once a second, hand what was logged to the operating system, which survives SIGKILL."""
         if self._file is not None and now_s - self._flushed_s >= FLUSH_S:
             self._flushed_s = now_s
-            self._file.flush()
+            try:
+                self._file.flush()
+            except OSError as error:
+                self._give_up(error)
+
+    def _give_up(self, error: OSError) -> None:
+        self.trouble = f"{self.path}: ends early ({error.strerror})"
+        file, self._file = self._file, None
+        with contextlib.suppress(OSError):  # what is in its buffer is lost
+            if file is not None:
+                file.close()
 
     def close(self) -> None:
-        """Write what is left, and the totals as JSON beside the log."""
-        if self._file is None or self.path is None:
+        """Write what is left, and the totals as JSON beside the log.
+
+        Raises ConfigError where the totals cannot be written.
+        """
+        if self.path is None:
             return
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        self._file.close()
-        self._file = None
+        if self._file is not None:
+            try:
+                self._file.flush()
+                os.fsync(self._file.fileno())
+                self._file.close()
+            except OSError as error:
+                self._give_up(error)
+            self._file = None
         document: dict[str, Any] = {"about": self.about, "sum": asdict(self.sum)}
         write_json(self.path.with_suffix(".json"), document)
 
 
-def _opened(path: Path) -> IO[str]:
+def _opened(path: Path, header: list[str]) -> IO[str]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        return path.open("w", encoding="utf-8", newline="")
+        file = path.open("w", encoding="utf-8", newline="")
+        file.writelines([*header, ",".join(COLUMNS) + "\n"])
+        file.flush()
+        return file
     except OSError as error:
         raise ConfigError(
             f"parameter shadow_log: {path} cannot be written ({error.strerror})"

@@ -288,13 +288,33 @@ def test_a_policy_that_answers_with_no_number_for_long_is_not_trusted_any_more(t
     cycle.write_text("time_s,power_demand_w\n" + "".join(f"{k},9e4\n" for k in range(40)))
     run, answerer = prepare_run("paper", str(cycle), mode="real_time"), Answerer(Lost())
     answerer.start_run(run.info)
-    modes = []
+    modes, reasons = [], set()
     while not run.done:
         (command,) = observe(answerer, run.samples(), now_s=float(run.k))
         modes.append(command.mode)
+        reasons.add(command.reason)
         run.apply(BatteryPowerCommand(run.stamp_ns, 0.0))
     assert modes[0] is CommandMode.NOMINAL and modes[-1] is CommandMode.FALLBACK
+    assert reasons == {Reason.POLICY_ERROR, Reason.FAULT}
     assert answerer.decider.trust.condition is Condition.FAULT
+
+
+@pytest.mark.parametrize("broken", [False, True])
+def test_a_clock_that_is_set_back_makes_no_fault_forgotten(make_run, broken):
+    class Policy(Counting):
+        def act(self, observation, state):
+            if broken:
+                raise ValueError("out of order")
+            return super().act(observation, state)
+
+    run, answerer = make_run(mode="real_time"), Answerer(Policy())
+    answerer.start_run(run.info)
+    observe(answerer, run.samples(), now_s=1.0)
+    decider = answerer.decider
+    decider.set_back()
+    assert decider.trust.condition is (Condition.FAULT if broken else Condition.STALE)
+    said = answerer.overdue(9.0)
+    assert said.mode is CommandMode.FALLBACK, "it drives, so it goes on saying so"
 
 
 def test_an_implausible_observation_is_not_answered(make_run):

@@ -4,6 +4,7 @@ import csv
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from tractor_ems.answer import Answerer
 from tractor_ems.decide import Applied, DecideConfig
 from tractor_ems.evaluate import evaluate
+from tractor_ems.nodes.policy_setup import PolicySetup, papers_of
 from tractor_ems.policies.q_policy import load_policy
 from tractor_ems.policies.registry import policy_file
 from tractor_ems.policies.rules import Conventional, RuleBased
@@ -157,3 +159,37 @@ def test_a_place_that_cannot_be_written_is_refused_by_name(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=r"parameter shadow_log: .*file/shadow.csv"):
         ShadowLog(PAPER, 1.0, PRICE, tmp_path / "file" / "shadow.csv")
+
+
+def test_a_disk_that_is_full_ends_the_file_and_not_the_drive(tmp_path):
+    with pytest.raises(ConfigError, match="No space left"):
+        ShadowLog(PAPER, 1.0, PRICE, Path("/dev/full"))
+    log = ShadowLog(PAPER, 1.0, PRICE, tmp_path / "shadow.csv")
+    log._file.close()
+    with Path("/dev/full").open("w", buffering=1) as log._file:
+        for second in (1, 2, 3):
+            stamp_ns, applied = second * 1_000_000_000, Applied(engine_power_w=1e5)
+            log.tick(seen(stamp_ns), BatteryPowerCommand(stamp_ns, 0.0), applied)
+            log.flush(now_s=2.0 * second)
+    assert log.sum.ticks == 2 and "No space left" in log.trouble
+    log.close()
+    assert json.loads((tmp_path / "shadow.json").read_text())["sum"]["ticks"] == 2
+
+
+@pytest.mark.parametrize(
+    ("shadow_log", "report", "named"),
+    [("d.json", "", "shadow_log: d.json"), ("d.csv", "d.json", "report: d.json")],
+)
+def test_two_papers_do_not_share_a_file(shadow_log, report, named):
+    values = {"shadow_log": shadow_log, "report": report, "shadow": True}
+    with pytest.raises(ConfigError, match=named):
+        papers_of(PolicySetup(RuleBased(PAPER), params=PAPER), None, values)
+
+
+def test_a_report_says_from_the_beginning_that_the_drive_has_not_ended(tmp_path):
+    values = {"shadow_log": "", "report": str(tmp_path / "report.json"), "shadow": False}
+    papers_of(PolicySetup(RuleBased(PAPER), params=PAPER), None, values)
+    assert json.loads((tmp_path / "report.json").read_text())["ended"] is False
+    values["report"] = "/dev/null/report.json"
+    with pytest.raises(ConfigError, match=r"/dev/null/report.json: cannot be written"):
+        papers_of(PolicySetup(RuleBased(PAPER), params=PAPER), None, values)

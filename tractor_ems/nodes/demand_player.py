@@ -130,7 +130,7 @@ class DemandPlayer:
             RunAborted: another player was there first.
         """
         name = topics.DUTY_CYCLE_DEMAND.name
-        count = self._node.count_publishers(name)
+        count = self._node.count_publishers(self._node.resolve_topic_name(name))
         if count > 1 and self._replay.seen < 0:
             raise RunAborted(
                 f"{count} publishers on {name}, allowed 1: another player is there "

@@ -121,7 +121,9 @@ class DrivingNode(ABC):
             self._node.get_logger().error(
                 f"{others + 1} publishers on {name}, allowed 1", throttle_duration_sec=10.0
             )
-        warning = warns(self._answers, self.outlet.mismatches, others)
+        if self._papers.log is not None and self._papers.log.trouble:
+            self._node.get_logger().error(self._papers.log.trouble, once=True)
+        warning = warns(self._answers, self.outlet.mismatches, self._papers.log, others)
         array = diagnostic_array(self._node, state_of(self._answers), values, warning=warning)
         self._diagnostics.publish(array)
 
@@ -137,7 +139,7 @@ class DrivingNode(ABC):
             if self._papers.log is not None:
                 self._papers.log.close()
             if self._papers.report is not None:
-                write_report(self._papers.report, self._values())
+                write_report(self._papers.report, {"ended": True, **self._values()})
         except TractorEmsError as error:
             print(f"{name}: {error}", file=sys.stderr)
         line = line_of(self._answers, self.outlet.latencies, self._papers.log)

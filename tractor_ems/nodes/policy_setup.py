@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from tractor_ems import handover
 from tractor_ems.answer import Answerer, RunCheck
 from tractor_ems.decide import DecideConfig
+from tractor_ems.drive_report import write_report
 from tractor_ems.handover import HandoverConfig
 from tractor_ems.policies.protocol import Policy
 from tractor_ems.shadow_log import ShadowLog, price_of
@@ -112,10 +113,20 @@ def papers_of(
 ) -> Paperwork:
     """What the parameters ask for; there is a log where there is a shadow or a file for it.
 
-    Raises ConfigError where the file cannot be written or no powertrain is known.
+    A report that never ends says so, so that a crash does not look like the drive before it.
+
+    Raises ConfigError where a file cannot be written, two have one name, or no powertrain is
+    known.
     """
     path, params, shadow = values["shadow_log"], setup.params, values["shadow"]
     report = Path(values["report"]) if values["report"] else None
+    totals = Path(path).with_suffix(".json") if path else None
+    if path and Path(path) == totals:
+        raise ConfigError(f"parameter shadow_log: {path}, its totals go there; call it .csv")
+    if report is not None and report in (totals, Path(path)):
+        raise ConfigError(f"parameter report: {report}, shadow_log {path} writes there")
+    if report is not None:
+        write_report(report, {"ended": False, "policy": setup.policy.name})
     if params is None or not (path or shadow):
         if path:
             raise ConfigError(f"parameter shadow_log: {path}, needs a policy with a powertrain")

@@ -74,7 +74,8 @@ class CommandOutlet:
     def others(self) -> int:
         """Other publishers on the command topic."""
         own = self._commands is not None
-        return max(self._node.count_publishers(topics.COMMAND.name) - own, 0)
+        name = self._node.resolve_topic_name(topics.COMMAND.name)  # counting does not remap
+        return max(self._node.count_publishers(name) - own, 0)
 
     def names_of_others(self) -> str:
         """Nodes with a publisher on the command topic, this one left out."""

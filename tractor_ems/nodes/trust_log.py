@@ -7,6 +7,7 @@ from rclpy.node import Node
 from tractor_ems.decide import Decider
 from tractor_msgs_py import supervisor
 from tractor_msgs_py.supervisor import Condition
+from tractor_msgs_py.types import Reason
 
 
 class TrustLog:
@@ -29,5 +30,6 @@ class TrustLog:
         condition = decider.trust.condition
         if condition is not self._condition and Condition.INIT not in (condition, self._condition):
             text = supervisor.describe(decider.trust)
-            self._logger.warning(f"{text}; {decider.complaint}" if decider.complaint else text)
+            because = decider.trust.reason is Reason.OBSERVATION_IMPLAUSIBLE and decider.complaint
+            self._logger.warning(f"{text}; {decider.complaint}" if because else text)
         self._condition = condition
