@@ -9,7 +9,7 @@ from tractor_msgs_py.errors import BagError, ConfigError, CycleError
 from tractor_msgs_py.signals import SignalMap
 from tractor_msgs_py.topics import POWER_DEMAND
 from tractor_msgs_py.trajectory import FloatArray
-from tractor_msgs_py.types import PowerDemand
+from tractor_msgs_py.types import PowerDemand, RunInfo
 from tractor_sim.duty_cycle.cycle import DutyCycle
 from tractor_sim.duty_cycle.cycle_csv import read_rows, write_cycle_csv
 from tractor_sim.duty_cycle.resample import Account, ImportSettings, Samples, resample
@@ -117,12 +117,7 @@ def _from_bag(path: Path, aux_w: float | None) -> Samples:
         refused=refused,
     )
     if info is not None:
-        if aux_w is not None:
-            raise CycleError(
-                f"--aux-w: {aux_w:g} W, but {path} announces auxiliaries of {info.p_aux_w:g} W; "
-                "allowed only for a recording that announces none"
-            )
-        return _less(samples, info.p_aux_w, "announced by the recording")
+        return _less_announced(samples, aux_w, info)
     if aux_w is not None:
         return _less(samples, aux_w, "--aux-w")
     return replace(samples, auxiliaries="unknown, not removed")
@@ -148,11 +143,21 @@ def _from_vehicle(
         place_name="value",
         refused=["" if stamp > 0 else "zero_stamp" for stamp in stamp_ns.tolist()],
     )
+    if series.info is not None:
+        return _less_announced(samples, aux_w, series.info)
     if aux_w is not None:
         return _less(samples, aux_w, "--aux-w")
-    if series.info is not None:
-        return _less(samples, series.info.p_aux_w, "announced by the recording")
     return _less(samples, signals.p_aux_w, "of the signal map")
+
+
+def _less_announced(samples: Samples, aux_w: float | None, info: RunInfo) -> Samples:
+    """Samples without the auxiliaries that their recording announces; no other word counts."""
+    if aux_w is not None:
+        raise CycleError(
+            f"--aux-w: {aux_w:g} W, but {samples.source} announces auxiliaries of "
+            f"{info.p_aux_w:g} W; allowed only for a recording that announces none"
+        )
+    return _less(samples, info.p_aux_w, "announced by the recording")
 
 
 def _less(samples: Samples, aux_w: float, known_from: str) -> Samples:

@@ -64,7 +64,8 @@ def make_scenario(
     if signals is not None and is_bag(cycle):
         from tractor_ems.bags.sampled_traces import cycle_of_sampled_bag
 
-        duty_cycle = cycle_of_sampled_bag(Path(cycle), signals, params.dt_s, namespace)
+        sampled = cycle_of_sampled_bag(Path(cycle), signals, params.dt_s, namespace)
+        duty_cycle = with_shipped_split(sampled)
     else:
         duty_cycle = resolve_cycle(cycle)
     if abs(duty_cycle.dt_s - params.dt_s) > 1e-9:

@@ -1,15 +1,21 @@
 """Bags that no vehicle of ours would write: foreign names, empty stamps, equal times."""
 
 import json
+from pathlib import Path
 
 import pytest
 
 from tractor_ems.bags.rosbags_messages import RosbagsMessages, serialize, typestore
+from tractor_ems.bags.sampled import series_of
+from tractor_ems.bags.sampled_traces import iter_sampled_traces
 from tractor_ems.bags.write import BagWriter
 from tractor_ems.cli import main
+from tractor_ems.scenario import make_scenario
 from tractor_ems.signals.config import load_signal_map
+from tractor_msgs_py.errors import BagError
 from tractor_msgs_py.topics import JOINT_STATE, Topic
 
+BAGS = Path(__file__).resolve().parents[2] / "bags"
 FLOAT64 = "std_msgs/msg/Float64"
 
 
@@ -59,3 +65,39 @@ def test_a_bag_of_which_hardly_anything_can_be_used_does_not_pass(capsys, tmp_pa
     assert "repeated 19" in found["samples"]["detail"]
     assert main([*words, "--dt", "0"]) == 2
     assert "--dt: 0.0, allowed 0.001..3600" in capsys.readouterr().err
+
+
+def test_an_imported_series_follows_the_fastest_source(tmp_path):
+    """Voltage once a second, current ten times: the first source must not set the rate."""
+    with BagWriter(tmp_path / "bag", {n: Topic(n, FLOAT64) for n in ("/u", "/i")}, {}) as bag:
+        for k in range(30):
+            at_ns = (k + 10) * 10**8
+            if k % 10 == 0:
+                bag.write("/u", number(600.0), at_ns, at_ns)
+            bag.write("/i", number(float(k)), at_ns + 1, at_ns + 1)
+    factors = ", ".join(f"{{topic: {n}, type: {FLOAT64}, field: data}}" for n in "ui")
+    path = tmp_path / "map.yaml"
+    path.write_text(f"vehicle: x\nsignals: {{power_demand_w: {{product: [{factors}]}}}}")
+    series = series_of(tmp_path / "bag", load_signal_map(path), "power_demand_w")
+    assert series.value.tolist() == [600.0 * k for k in range(30)]
+
+
+def test_what_the_recording_announces_is_not_overruled_quietly(capsys, tmp_path):
+    words = ["cycle", "import", str(BAGS / "dp_planter"), "--out", str(tmp_path / "a.csv")]
+    assert main([*words, "--signals", "signals", "--aux-w", "100"]) == 2
+    assert "announces auxiliaries of 0 W" in capsys.readouterr().err
+
+
+def test_a_map_beside_a_cycle_that_is_no_bag_is_refused(capsys):
+    assert main(["evaluate", "--cycle", "planter_1001", "--signals", "signals"]) == 2
+    assert "--signals: no --cycle is a bag" in capsys.readouterr().err
+
+
+def test_a_shipped_cycle_in_a_bag_keeps_its_split_through_a_map():
+    made = make_scenario("paper", str(BAGS / "dp_planter"), signals=load_signal_map())
+    assert made.cycle.split == "train"
+
+
+def test_what_a_drive_lacks_is_named(tmp_path):
+    with pytest.raises(BagError, match=r"all that a drive needs \(soc, .* never\)"):
+        iter_sampled_traces([BAGS / "demand_only"], load_signal_map(), 1.0, driven=True)

@@ -4,6 +4,7 @@ Messages go through the live node's ObservationBuilder in the order of their rec
 and observations are the live ones. Traces to learn from are made in ``sampled_traces``.
 """
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -259,8 +260,8 @@ class Series:
     """Every value of one signal as it was recorded, shape (N,), in the order of recording.
 
     Attributes:
-        stamp_ns, value: of each new value of the signal's first source, with the others as they
-            were known by then.
+        stamp_ns, value: of each new value of the signal's source with the most messages, with the
+            others as they were known by then.
         info: the run that was announced; None where none was, or several were.
         runs: announced runs.
     """
@@ -283,6 +284,9 @@ def series_of(path: Path, signals: SignalMap, name: str, namespace: str | None =
         raise ConfigError(f"{signals.origin or 'signal map'}: has no signal {name}")
     (signal,) = signals.of([name])
     wiring = wire(bag, signals, namespace, [name])
+    lead = max(
+        signal.sources, key=lambda s: bag.topics[full_name(wiring.namespace, s.topic)].messages
+    )
     latest: dict[Source, float] = {}
     stamps: list[int] = []
     values: list[float] = []
@@ -293,10 +297,10 @@ def series_of(path: Path, signals: SignalMap, name: str, namespace: str | None =
             wiring.sources[heard.topic], heard.message, heard.publish_ns
         ):
             latest[source] = number
-            if source != signal.sources[0] or any(s not in latest for s in signal.sources):
+            if source != lead or any(s not in latest for s in signal.sources):
                 continue
             stamps.append(stamp_ns)
-            values.append(sum(float(np.prod([latest[s] for s in term])) for term in signal.terms))
+            values.append(sum(math.prod(latest[s] for s in term) for term in signal.terms))
     if not stamps:
         raise BagError(f"{path}: no value of {name}")
     infos = {info.run_id: info for info in _announced(bag, wiring)}

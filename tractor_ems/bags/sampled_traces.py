@@ -21,6 +21,9 @@ from tractor_sim.duty_cycle.cycle import DutyCycle
 STATES = ("soc", "battery_power_w", "fuel_kg_per_s")
 """Signals besides demand and engine without which a tick is not part of a driven trace."""
 
+DRIVEN = (*NEEDED, *STATES)
+"""All of them; engine power follows from the balance where it is not there."""
+
 
 def iter_sampled_traces(
     paths: Iterable[Path],
@@ -76,7 +79,7 @@ def traces_of_sampled(
     period that ends there. So a trace with states has a step less than it has ticks.
 
     Raises:
-        BagError: there is no tick with a demand.
+        BagError: no two ticks in a row have a demand, or, ``driven``, all states.
     """
     dt_ns = round(dt_s * 1e9)
     traces = []
@@ -93,8 +96,12 @@ def traces_of_sampled(
                 part = run.ticks[first:last]
                 traces.append(_trace(bag, run, part, signals, dt_s, first == begin))
     if not traces:
+        wanted = "all that a drive needs" if driven else "a power_demand_w"
+        known = {name for run in bag.runs for tick in run.ticks for name in tick.frame.values}
+        lacking = [name for name in DRIVEN if driven and name not in known]
+        never = f" ({', '.join(lacking)} never)" if lacking else ""
         raise BagError(
-            f"{bag.path}: no two ticks of {dt_s:g} s in a row with a power_demand_w"
+            f"{bag.path}: no two ticks of {dt_s:g} s in a row with {wanted}{never}"
             + "".join(f"; {text}" for text in bag.complaints.values())
         )
     return traces

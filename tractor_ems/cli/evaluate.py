@@ -76,7 +76,7 @@ def evaluate(
     table with a row per run and a summary per policy.
     """
     from tractor_ems.evaluate_set import Options, pairs
-    from tractor_ems.scenario import make_scenario
+    from tractor_ems.scenario import is_bag, make_scenario
     from tractor_ems.signals.config import optional_map
 
     kinds: dict[str, Transport] = {"in_process": "in_process", "ros": "ros"}
@@ -89,6 +89,8 @@ def evaluate(
             "--signals: allowed with --transport in_process; ems cycle import makes a cycle of "
             "the bag that nodes can drive"
         )
+    if vehicle is not None and not any(map(is_bag, _cycles(cycle, cycle_set))):
+        raise ConfigError("--signals: no --cycle is a bag, allowed beside one that is")
     scenarios = [
         make_scenario(powertrain, name, soc0, soc_target, signals=vehicle, namespace=namespace)
         for name in _cycles(cycle, cycle_set)

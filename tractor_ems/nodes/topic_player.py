@@ -46,7 +46,9 @@ class TopicPlayer:
         found = [topic for topic in found if not lockstep or topic.name != command]
         self._publishers, self._skipped = raw_publishers(node, found)
         if not self._publishers:
-            raise ConfigError(f"{path}: no installed message type: {', '.join(self._skipped)}")
+            raise ConfigError(
+                f"{path}: nothing that ROS here can publish: {', '.join(self._skipped)}"
+            )
         if lockstep and demand not in self._publishers:
             raise ConfigError(f"parameters topics, exclude: lockstep needs {demand}")
         messages = messages_of(path, choice, list(self._publishers))
