@@ -36,8 +36,9 @@ def spec_on(
 ) -> ObservationSpec:
     """What a policy needs to see on a vehicle.
 
-    A policy for sampled signals keeps its own spec. One for equal stamps keeps its filters and
-    its step length, and is sampled as the map says.
+    A policy for sampled signals keeps its own spec; what it does not see may be sampled otherwise
+    than where it learnt. One for equal stamps keeps its filters and its step length, and is
+    sampled as the map says.
 
     Args:
         signals: the vehicle's.
@@ -53,7 +54,8 @@ def spec_on(
         lag_s = min(lag_s, dt_s)
         return ObservationSpec(SAMPLED_SIGNALS, dt_s, spec.filters, "sampled", sampling, lag_s)
     own = {way.signal: way.how for way in spec.sampling}
-    for signal in signals.signals:
+    seen = OBSERVED if "engine_power_w" in signals.names else (*OBSERVED, "battery_power_w")
+    for signal in signals.of(seen):
         how = own.get(signal.name)
         if None not in (signal.how, how) and signal.how != how:
             raise PolicyError(

@@ -1,7 +1,7 @@
 """A real policy that drives a real plant at 10 Hz in real time: how many ticks were missed, and
 how long it took from an observation that is complete to its command. A report, no test.
 
-python test/nodes/measure_real_time.py [--seconds 600] [--out FILE.json]
+python test/nodes/measure_real_time.py [--seconds 600] [--policy FILE] [--out FILE.json]
 """
 
 import json
@@ -17,6 +17,7 @@ from measuring import Section, machine, publish, quantiles, shown
 from nodes.scripted import random_demand, write_cycle
 from nodes.stage import Process, Stage, stage
 
+from tractor_ems.policies.q_policy import load_policy
 from tractor_msgs_py import topics
 from tractor_msgs_py.codec import decode_command, stamp_to_ns
 from tractor_msgs_py.ros.messages import CLASSES
@@ -76,17 +77,16 @@ def cpu_share(process: Process, since: tuple[float, float] | None) -> tuple[floa
     return now if since is None else ((now[0] - since[0]) / (now[1] - since[1]), now[1])
 
 
-def drive(mode: str, seconds: float, executable: str) -> dict[str, Any]:
+def drive(mode: str, seconds: float, executable: str, file: Path | None) -> dict[str, Any]:
     """One run, watched."""
+    which = {"powertrain": POWERTRAIN} if file is None else {"policy_file": file.resolve()}
     with stage() as on:
         heard = Heard()
         heard.listen(on)
         steps = round(seconds / PERIOD_S)
         cycle = write_cycle(on.folder / "work.csv", random_demand(0, steps), PERIOD_S)
         report, output = on.folder / "report.json", on.folder / "run"
-        policy = on.start(
-            executable, powertrain=POWERTRAIN, report=report, history_depth=100, **MODES[mode]
-        )
+        policy = on.start(executable, **which, report=report, history_depth=100, **MODES[mode])
         plant = on.start(
             "plant_sim", powertrain=POWERTRAIN, cycle=cycle, mode="real_time", output=output,
             expected_recorders=1, command_timeout_s=0.5, history_depth=100,
@@ -159,12 +159,22 @@ def latency_of(report: dict[str, Any]) -> dict[str, float]:
 def main(
     seconds: float = 600.0,
     executable: str = "rule_based_policy",
+    policy: Path | None = None,
     out: Path | None = None,
     record: str | None = None,
 ) -> None:
-    """Drive for SECONDS with observations of equal stamp, then as long through a signal map."""
+    """Drive for SECONDS with observations of equal stamp, then as long through a signal map.
+
+    With --policy, a policy file for that powertrain, ddqn_policy drives instead; one that was
+    learnt through a signal map drives through the plant's alone.
+    """
     before = machine()
-    found = {mode: drive(mode, seconds, executable) for mode in MODES}
+    modes = list(MODES)
+    if policy is not None:
+        executable = "ddqn_policy"
+        if load_policy(policy).spec.mode == "sampled":
+            modes = ["sampled"]
+    found = {mode: drive(mode, seconds, executable, policy) for mode in modes}
     missed = {
         mode: f["unanswered"] + f["plant"]["fallback_ticks"] + f["plant_late"]
         for mode, f in found.items()

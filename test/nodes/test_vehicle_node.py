@@ -334,6 +334,21 @@ def test_a_map_that_samples_otherwise_than_the_policy_was_made_for_is_refused():
         SampledAnswerer(Half(spec=spec), signals, DecideConfig(params=PARAMS))
 
 
+def test_what_a_policy_does_not_see_may_be_sampled_otherwise_than_where_it_learnt():
+    spec = ObservationSpec(
+        ("power_demand_w", "soc", "engine_power_w"),
+        0.1,
+        mode="sampled",
+        sampling=(Sampling("battery_power_w", "mean", 5.0),),
+    )
+    battery = replace(BUS.signals[0], name="battery_power_w", how="last")
+    signals = replace(BUS, signals=(*BUS.signals, battery))
+    assert SampledAnswerer(Half(spec=spec), signals, DecideConfig(params=PARAMS)).spec == spec
+    blind = replace(signals, signals=tuple(s for s in signals.signals if "engine" not in s.name))
+    with pytest.raises(PolicyError, match=r"battery_power_w\.how: last"):
+        SampledAnswerer(Half(spec=spec), blind, DecideConfig(params=PARAMS))
+
+
 @pytest.mark.slow
 def test_a_shadow_takes_over_from_a_real_incumbent_and_its_log_survives_sigkill(
     start, graph, wait_for, tmp_path
