@@ -13,6 +13,10 @@ from tractor_sim.duty_cycle.cycle import POWER_LIMIT_W
 from tractor_sim.plant_run import PlantRun
 
 
+GONE_S = 5.0
+"""A player that announced a cycle is looked for at least this long before it counts as gone [s]."""
+
+
 class TopicDemand:
     """Hands a player's demand to a run and watches that it goes on.
 
@@ -55,8 +59,8 @@ class TopicDemand:
         """Look whether the run can go on; ``driving``: its first tick is out.
 
         Raises:
-            RunAborted: more than one player is connected, or the demand of the present tick is
-                missing for longer than the timeout.
+            RunAborted: more than one player is connected, the demand of the present tick is
+                missing for longer than the timeout, or the player went before the first.
         """
         name = topics.DUTY_CYCLE_DEMAND.name
         run = self._run
@@ -64,12 +68,15 @@ class TopicDemand:
             return
         if publishers > 1:
             raise RunAborted(f"{publishers} publishers on {name}, allowed 1")
-        missing = driving and (run.held or not run.ready)
+        missing = run.held or not run.ready
+        timeout_s = self._timeout_s
+        if not driving:  # a policy is waited for, together with the player
+            missing, timeout_s = missing and publishers == 0, max(timeout_s, GONE_S)
         if not missing or self._there_s is None:
             self._there_s = now_s
-        elif now_s - self._there_s > self._timeout_s:
+        elif now_s - self._there_s > timeout_s:
             raise RunAborted(
                 f"no {name} of tick {run.k} (stamp {run.stamp_ns} ns), none in time for "
-                f"{self._timeout_s:g} s: the player ended, hangs or lags, "
+                f"{timeout_s:g} s: the player ended, hangs or lags, "
                 f"{publishers} publishers on {name}"
             )

@@ -117,6 +117,15 @@ def test_demand_that_stays_away_ends_the_run_with_the_tick_that_misses_it(mode):
         demand.check(0, driving=True, now_s=2e3 + 5.1)
 
 
+def test_a_player_that_goes_before_the_first_tick_ends_the_run_and_one_that_waits_does_not():
+    _, demand = topic_run()
+    for now_s in (0.0, 1e3):
+        demand.check(1, driving=False, now_s=now_s)
+    demand.check(0, driving=False, now_s=1e3 + 5.0)
+    with pytest.raises(RunAborted, match="tick 0 .*0 publishers"):
+        demand.check(0, driving=False, now_s=1e3 + 5.1)
+
+
 def test_a_finished_run_misses_no_player():
     run, demand = topic_run()
     offer(demand, *range(len(DEMAND_W)))
