@@ -12,9 +12,8 @@ from tractor_msgs_py.types import DutyCycleDemand, DutyCycleInfo
 from tractor_sim.duty_cycle.cycle import POWER_LIMIT_W
 from tractor_sim.plant_run import PlantRun
 
-
 GONE_S = 5.0
-"""A player that announced a cycle is looked for at least this long before it counts as gone [s]."""
+"""A player that announced a cycle is looked for at least this long until it counts as gone [s]."""
 
 
 class TopicDemand:

@@ -122,7 +122,7 @@ def test_a_player_that_goes_before_the_first_tick_ends_the_run_and_one_that_wait
     for now_s in (0.0, 1e3):
         demand.check(1, driving=False, now_s=now_s)
     demand.check(0, driving=False, now_s=1e3 + 5.0)
-    with pytest.raises(RunAborted, match="tick 0 .*0 publishers"):
+    with pytest.raises(RunAborted, match=r"tick 0 .*0 publishers"):
         demand.check(0, driving=False, now_s=1e3 + 5.1)
 
 
