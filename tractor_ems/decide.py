@@ -285,8 +285,11 @@ class Decider:
         if self._observation is not None and not self._supervised:
             raise PolicyError("not in lockstep: the plant waits for every answer of one policy")
         if self._observation is None or not self.trust.nominal:
-            what = self.trouble or self.complaint or "no observation of a run yet"
-            raise PolicyError(f"{supervisor.describe(self.trust)}; {what}")
+            detail = self.trouble or self.complaint
+            if not detail and self._observation is None:
+                detail = "no observation of a run that can be used yet, see /diagnostics"
+            said = supervisor.describe(self.trust)
+            raise PolicyError(f"{said}; {detail}" if detail else said)
         if self.mode in (Mode.ENGAGING, Mode.ENGAGED):
             return f"already {self.mode.name.lower()}"
         self.handover = ho.engage(self.handover)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from rclpy.node import Node
 from rclpy.parameter import Parameter as Setting
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
@@ -21,7 +22,7 @@ from tractor_ems.nodes import rule_based_policy
 from tractor_ems.nodes.policy_node import PolicyNode
 from tractor_ems.nodes.policy_parameters import COMMON, SOC_TARGET
 from tractor_ems.nodes.policy_setup import Paperwork
-from tractor_ems.nodes.policy_topics import SHADOW
+from tractor_ems.nodes.policy_topics import SHADOW, CommandOutlet
 from tractor_ems.nodes.vehicle_node import VehicleNode
 from tractor_ems.policies.protocol import ANY_RUN
 from tractor_ems.policies.rules import RuleBased
@@ -207,6 +208,26 @@ def test_enabling_is_refused_beside_another_policy_and_without_observations(grap
     message = refused()
     assert "/incumbent" in message and "stop them first" in message
     assert node._answerer.decider.mode is Mode.SHADOW
+
+
+def test_another_policy_is_seen_on_a_command_topic_of_another_name(graph):
+    named = ["--ros-args", "-r", f"{topics.COMMAND.name}:=renamed"]
+    node = Node("policy", context=graph.context, cli_args=named)
+    outlet = CommandOutlet(node, 10, driving=True, shadow=False)
+    graph.peer().node.create_publisher(JointState, "renamed", 10)
+    graph.spin_until(lambda: outlet.others() == 1, "the other policy")
+    node.destroy_node()
+
+
+def test_what_a_policy_was_held_up_with_is_not_said_late(graph, drive, vehicle):
+    node = drive(BUS, Half())
+    until(graph, vehicle, lambda: node.outlet.latencies.count, "a command")
+    said, skipped = node.outlet.latencies.count, node._answerer.count.skipped
+    decision, now_ns = node._answerer.decision, time.monotonic_ns()
+    node._say([decision], now_ns - 3_000_000_000)
+    assert (node.outlet.latencies.count, node._answerer.count.skipped) == (said, skipped + 1)
+    node._say([decision], now_ns)
+    assert node.outlet.latencies.count == said + 1
 
 
 def test_a_policy_that_fails_becomes_the_fallback_law_and_the_node_lives(graph, drive, vehicle):

@@ -33,7 +33,7 @@ def _engage(decider: Decider, outlet: CommandOutlet) -> str:
     if others and decider.mode is Mode.SHADOW:
         raise PolicyError(
             f"{others} other publishers on {topics.COMMAND.name}: {outlet.names_of_others()}; "
-            "stop them first"
+            "stop them first (a killed one counts for about 20 s)"
         )
     text = decider.engage()
     outlet.open()

@@ -124,9 +124,14 @@ class VehicleNode(DrivingNode):
         return self._answerer.decider.handover.commanding and self.outlet.listeners() > 0
 
     def _say(self, decisions: Iterable[Decision], since_ns: int) -> None:
-        """Every decision is followed, the newest command alone is published."""
+        """Every decision is followed, the newest command alone is published, and none whose
+        message arrived before the timeout: this process was held up since."""
         command = None
         for decision in decisions:
             self._follow(decision)
             command = decision.command or command
+        timeout_s = self._answerer.decider.config.timeout_s
+        if command is not None and time.monotonic_ns() - since_ns > timeout_s * 1e9:
+            self._answerer.count.skipped += 1
+            return
         self.outlet.say(command, since_ns)
