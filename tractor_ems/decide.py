@@ -97,7 +97,7 @@ class Decider:
             fallback commands given.
         complaint: the last text about an implausible observation.
         trouble: what the policy raised, empty where it did not.
-        reasons: bad observations by reason.
+        reasons: bad observations and answers by reason, of all runs.
     """
 
     def __init__(self, policy: Policy, config: DecideConfig) -> None:
@@ -207,6 +207,7 @@ class Decider:
             command, self._memory = self.policy.act(observation, self._memory)
         except Exception as error:  # any: a driver that fails must be replaced, not mourned
             self.trouble = f"{type(error).__name__}: {error}"
+            self.reasons[Reason.POLICY_ERROR.name.lower()] += 1
             self.trust = supervisor.fault(self.trust, Reason.POLICY_ERROR)
         if command is not None and not np.isfinite(command.battery_power_w).all():
             self.bad(now_s, Reason.POLICY_ERROR)
@@ -275,6 +276,7 @@ class Decider:
         self.fallbacks += 1
         if self.mode is Mode.DISENGAGING:
             self.handover = HandoverState()
+            self.clear()
             return ho.ended(self._observation)
         said = vehicle_fallback(self._observation, self._reason())
         self.handover = replace(self.handover, generator_w=ho.set_point_w(self._observation, said))

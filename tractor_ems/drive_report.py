@@ -79,6 +79,7 @@ def values_of(
         "reason": supervisor.REASON_TEXT[decider.trust.reason],
         "other_policies": others,
         **answers.counters,
+        **{f"bad_{reason}": count for reason, count in sorted(decider.reasons.items())},
         **{f"latency_{key}": value for key, value in latencies.summary.items()},
     }
     for name, why in missing.items():

@@ -315,6 +315,7 @@ def test_a_clock_that_is_set_back_makes_no_fault_forgotten(make_run, broken):
     assert decider.trust.condition is (Condition.FAULT if broken else Condition.STALE)
     said = answerer.overdue(9.0)
     assert said.mode is CommandMode.FALLBACK, "it drives, so it goes on saying so"
+    assert decider.reasons == ({"policy_error": 1} if broken else {})
 
 
 def test_an_implausible_observation_is_not_answered(make_run):

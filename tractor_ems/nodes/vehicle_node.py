@@ -4,7 +4,7 @@ Any publisher is heard: subscriptions are best effort, which fits every QoS a ve
 """
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rclpy.clock import Clock
@@ -123,15 +123,16 @@ class VehicleNode(DrivingNode):
     def _heard(self) -> bool:
         return self._answerer.decider.handover.commanding and self.outlet.listeners() > 0
 
-    def _say(self, decisions: Iterable[Decision], since_ns: int) -> None:
+    def _say(self, decisions: Sequence[Decision], since_ns: int) -> None:
         """Every decision is followed, the newest command alone is published, and none whose
         message arrived before the timeout: this process was held up since."""
         command = None
         for decision in decisions:
-            self._follow(decision)
             command = decision.command or command
         timeout_s = self._answerer.decider.config.timeout_s
         if command is not None and time.monotonic_ns() - since_ns > timeout_s * 1e9:
             self._answerer.count.skipped += 1
-            return
+            command = None
         self.outlet.say(command, since_ns)
+        for decision in decisions:  # what is not urgent
+            self._follow(decision)
