@@ -287,10 +287,10 @@ def road_of(tmp_path, **settings):
 
 def test_engaging_is_refused_before_there_is_an_observation(tmp_path):
     decider = Answerer(Aims(), config=DecideConfig(shadow=True)).decider
-    with pytest.raises(PolicyError, match="no observation of a run yet"):
+    with pytest.raises(PolicyError, match="no observation of a run that can be used yet"):
         decider.engage()
     decider.start(0.1, supervised=True)
-    with pytest.raises(PolicyError, match=r"INIT.*no observation of a run yet"):
+    with pytest.raises(PolicyError, match=r"INIT.*no observation of a run that can be used yet"):
         decider.engage()
 
 

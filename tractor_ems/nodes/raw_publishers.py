@@ -1,9 +1,6 @@
-"""Publishers of recorded topics: message classes by type name, whatever is installed."""
+"""Publishers of recorded topics, as far as their message types are installed."""
 
-import importlib
-import re
 from collections.abc import Iterable
-from typing import Any
 
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
@@ -11,20 +8,9 @@ from rclpy.publisher import Publisher
 from rclpy.validate_topic_name import validate_topic_name
 
 from tractor_ems.bags.replay_topics import RecordedTopic
+from tractor_msgs_py.errors import ConfigError
 from tractor_msgs_py.ros.shell import qos_profile
-
-_TYPE = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Za-z][A-Za-z0-9]*)")
-
-
-def message_class(type_name: str) -> Any | None:
-    """The installed message class of a ROS type name, or None."""
-    match = _TYPE.fullmatch(type_name)
-    if match is None:
-        return None
-    try:
-        return getattr(importlib.import_module(f"{match[1]}.msg"), match[2])
-    except (ImportError, AttributeError):
-        return None
+from tractor_msgs_py.ros.wire import message_class
 
 
 def _is_name(name: str) -> bool:
@@ -46,13 +32,15 @@ def raw_publishers(
     publishers: dict[str, Publisher] = {}
     skipped = []
     for topic in topics:
-        found = message_class(topic.type)
-        if found is None:
+        try:
+            found = message_class(topic.type)
+        except ConfigError:
             skipped.append(f"{topic.name} ({topic.type})")
-        elif not _is_name(topic.name):
+            continue
+        if not _is_name(topic.name):
             skipped.append(f"{topic.name!r} (no ROS name)")
-        else:
-            publishers[topic.name] = node.create_publisher(
-                found, topic.name.lstrip("/"), qos_profile(topic.qos)
-            )
+            continue
+        publishers[topic.name] = node.create_publisher(
+            found, topic.name.lstrip("/"), qos_profile(topic.qos)
+        )
     return publishers, skipped

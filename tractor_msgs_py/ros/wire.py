@@ -1,6 +1,7 @@
 """A row of the wire contract as an rclpy publisher or subscription."""
 
 import importlib
+import re
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
@@ -29,6 +30,8 @@ HISTORY_DEPTH = Parameter(
 
 WAIT_MAX_NS = 60_000_000_000
 """A message has not waited longer than this; the system's clock was set."""
+
+_TYPE = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Za-z][A-Za-z0-9]*)")
 
 Mismatch: TypeAlias = Callable[[str, str], None]
 """Told of a peer that cannot be heard: topic, and the QoS policy that does not fit."""
@@ -101,9 +104,12 @@ def message_class(type_name: str) -> Any:
     """The class of a ROS message type such as ``std_msgs/msg/Float64``.
 
     Raises:
-        ConfigError: the type or its package is not installed.
+        ConfigError: it is no type name, or the type or its package is not installed.
     """
-    package, _, name = type_name.partition("/msg/")
+    match = _TYPE.fullmatch(type_name)
+    if match is None:  # a name from a stranger's bag is not imported unseen
+        raise ConfigError(f"type {type_name!r}: expected pkg/msg/Name")
+    package, name = match.groups()
     try:
         return getattr(importlib.import_module(f"{package}.msg"), name)
     except ImportError:
