@@ -5,6 +5,7 @@ The policy nodes beside it only declare their parameters and build their policy.
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from rclpy.node import Node
@@ -58,13 +59,14 @@ class PolicyNode(DrivingNode):
         history_depth: int,
         papers: Paperwork | None = None,
     ) -> None:
-        self._answerer = answerer
+        self._answerer, self._depth = answerer, history_depth
         super().__init__(node, answerer, history_depth, papers)
 
     def _listen(self) -> None:
         for topic, decode in OBSERVED:
             on_sample = self._on_sample(topic, decode)
-            subscribe_to(self._node, topic, on_sample, self.outlet.mismatch)
+            deep = replace(topic.qos, depth=max(topic.qos.depth, self._depth))
+            subscribe_to(self._node, replace(topic, qos=deep), on_sample, self.outlet.mismatch)
 
     def _on_sample(
         self, topic: topics.Topic, decode: Callable[[Any], Observed]
