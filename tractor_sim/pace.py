@@ -3,6 +3,7 @@
 Pure; ``lockstep`` and ``real_time`` add when a step is taken and with which command.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections import Counter
 from dataclasses import dataclass
@@ -132,6 +133,10 @@ class Pace(ABC):
             return ()
         self.started = True
         return self._first_tick(now_s)
+
+    def wait_s(self, now_s: float) -> float:
+        """How long until :meth:`poll` has something to do for sure; inf where nobody knows [s]."""
+        return math.inf
 
     @abstractmethod
     def poll(self, command_publishers: int, now_s: float) -> tuple[Sample, ...]:

@@ -114,6 +114,11 @@ class RealTime(Pace):
         self._due_s = now_s
         return self._publish(now_s)
 
+    def wait_s(self, now_s: float) -> float:
+        """How long until the present step is over [s]."""
+        under_way = self.started and not self.done
+        return max(self._due_s - now_s, 0.0) if under_way else math.inf
+
     def poll(self, command_publishers: int, now_s: float) -> tuple[Sample, ...]:
         """Samples of the next tick when the present step's time is over, else nothing.
 

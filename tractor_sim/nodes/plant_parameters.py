@@ -21,8 +21,8 @@ WALL = "s wall clock"
 POLL_S = 0.02
 """How often the plant looks whether it is time for something, at the least [s]."""
 
-POLLS_PER_PERIOD, LEAST_POLL_S = 10.0, 0.001
-"""In real time a step ends this part of a period late at most: at 10 Hz by 10 ms."""
+LEAST_POLL_S = 0.001
+"""And at the most: in real time it looks again when the step is over [s]."""
 
 MIN_PERIOD_S = 0.005
 """Shortest step in real time that a node in Python keeps up with [s]."""
@@ -117,19 +117,19 @@ def run_of(values: Mapping[str, Any], announced: DutyCycleInfo | None = None) ->
     )
 
 
-def pace_of(run: PlantRun, values: Mapping[str, Any]) -> tuple[Pace, float]:
-    """The pace that was asked for and how often to poll it [s].
+def pace_of(run: PlantRun, values: Mapping[str, Any]) -> Pace:
+    """The pace that was asked for.
 
     Raises:
         ConfigError: steps too short for a wall clock.
     """
     match_timeout_s = values["match_timeout_s"]
     if run.info.lockstep:
-        return Lockstep(run, values["answer_timeout_s"], match_timeout_s), POLL_S
+        return Lockstep(run, values["answer_timeout_s"], match_timeout_s)
     period_s = values["period_s"] or run.params.dt_s
     if period_s < MIN_PERIOD_S:
         raise ConfigError(f"parameter period_s: {period_s:g}, allowed {MIN_PERIOD_S}..60 or 0")
-    pace = RealTime(
+    return RealTime(
         run,
         period_s,
         values["command_timeout_s"],
@@ -137,4 +137,8 @@ def pace_of(run: PlantRun, values: Mapping[str, Any]) -> tuple[Pace, float]:
         values["recover_after"],
         values["ramp_w_per_s"],
     )
-    return pace, max(LEAST_POLL_S, min(POLL_S, period_s / POLLS_PER_PERIOD))
+
+
+def poll_in_s(pace: Pace, now_s: float) -> float:
+    """When to look again whether it is time for something [s]."""
+    return max(LEAST_POLL_S, min(POLL_S, pace.wait_s(now_s)))

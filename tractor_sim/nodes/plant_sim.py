@@ -24,7 +24,7 @@ from tractor_msgs_py.ros.messages import RosMessages
 from tractor_msgs_py.ros.shell import run_node
 from tractor_msgs_py.ros.wire import publish_on, subscribe_to
 from tractor_msgs_py.types import Sample
-from tractor_sim.nodes.plant_parameters import PARAMETERS, pace_of, run_of
+from tractor_sim.nodes.plant_parameters import PARAMETERS, POLL_S, pace_of, poll_in_s, run_of
 from tractor_sim.pace import Peers
 from tractor_sim.plant_run import PlantRun
 from tractor_sim.run_files import clear_run, line_of, summary, write_run
@@ -39,7 +39,7 @@ class PlantSim:
     def __init__(self, node: Node, values: Mapping[str, Any], run: PlantRun | None = None) -> None:
         self._node, self._factory = node, RosMessages()
         self._run = run_of(values) if run is None else run
-        self._pace, poll_s = pace_of(self._run, values)
+        self._pace = pace_of(self._run, values)
         self._output = Path(values["output"]) if values["output"] else None
         if self._output is not None:
             clear_run(self._output)
@@ -51,7 +51,7 @@ class PlantSim:
         self._commands = subscribe_to(node, topics.COMMAND, self._on_command)
         self._diagnostics = publish_on(node, topics.DIAGNOSTICS)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(poll_s, self.poll, clock=steady)
+        self._polling = node.create_timer(POLL_S, self.poll, clock=steady)
         node.create_timer(PERIOD_S, self._diagnose, clock=steady)
         self._publish((self._run.info,))
         self._beginning, self._end = Delivery([self._message(self._run.info)]), Delivery([])
@@ -95,6 +95,8 @@ class PlantSim:
             self._publish(self._pace.poll(self._commands.get_publisher_count(), now_s))
         else:
             self._publish(self._pace.start(self._peers(), now_s))
+        self._polling.timer_period_ns = round(1e9 * poll_in_s(self._pace, time.monotonic()))
+        self._polling.reset()
 
     def _on_command(self, msg: Any) -> None:
         try:
