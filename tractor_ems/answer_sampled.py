@@ -160,9 +160,13 @@ class SampledAnswerer:
     def counters(self) -> dict[str, int]:
         """What people want to see."""
         decider, count = self.decider, self.count
-        refused = {f"refused_{reason}": n for reason, n in sorted(self.refusals.items())}
+        counted = sorted(self.refusals.items())
+        refused = {
+            f"refused_{why}": n for why, n in counted if why not in ("late", "silent_ticks")
+        }
         return {
             "ticks": count.ticks,
+            "late_samples": self.refusals["late"],
             "missed_ticks": count.blind + count.skipped + self.refusals["silent_ticks"],
             "corrected": decider.corrected,
             "fallbacks": decider.fallbacks,

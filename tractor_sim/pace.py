@@ -114,6 +114,11 @@ class Pace(ABC):
         return self.run.done
 
     @property
+    def state(self) -> str:
+        """What it is doing, for people."""
+        return f"waiting: {self.gate.missing}" if self.gate.missing else "driving"
+
+    @property
     def counters(self) -> dict[str, int | str]:
         """What people want to see: the pace's own count and refusals by reason."""
         refused = {f"refused_{reason}": count for reason, count in sorted(self.refusals.items())}

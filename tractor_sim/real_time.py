@@ -114,6 +114,11 @@ class RealTime(Pace):
         self._due_s = now_s
         return self._publish(now_s)
 
+    @property
+    def state(self) -> str:
+        """What it is doing, for people: the fallback law is no driving."""
+        return supervisor.describe(self.trust) if self.started else super().state
+
     def wait_s(self, now_s: float) -> float:
         """How long until the present step is over [s]."""
         under_way = self.started and not self.done

@@ -45,6 +45,13 @@ def test_without_a_command_the_fallback_law_drives(plant):
     assert plant.fallback_ticks == 1
 
 
+def test_a_plant_on_its_fallback_law_does_not_call_that_driving(plant):
+    plant.offer(command(plant, 10e3), 1, 0.5)
+    assert plant.state.startswith("NOMINAL")
+    plant.poll(1, 9.0)
+    assert plant.state.startswith("STALE") and "fallback law" in plant.state
+
+
 def test_between_commands_the_generator_holds_and_the_battery_is_the_slack(plant):
     plant.offer(command(plant, 10e3), 1, 0.5)
     plant.poll(1, 1.0)

@@ -108,9 +108,8 @@ class PlantSim:
         self._publish(self._pace.offer(command, publishers, time.monotonic()))
 
     def _diagnose(self) -> None:
-        missing = self._pace.gate.missing
-        state = f"waiting: {missing}" if missing else "driving"
-        if missing:
+        state = self._pace.state
+        if self._pace.gate.missing:
             self._node.get_logger().info(state, throttle_duration_sec=30.0)
         info = self._run.info
         mode = "lockstep" if info.lockstep else "real_time"
