@@ -24,6 +24,11 @@ DEFAULT_RAMP_W_PER_S = 60e3
 HOLD_TICKS = 3
 """Ticks for which a new publisher holds what is applied, until everybody hears it."""
 
+MOST_WAITS = 3
+"""Ticks for which the ramp stands while the generator has not followed its last step: a command
+that came too late to be applied must not make the next step twice as large. A generator that
+never shows what it does is moved all the same, at a quarter of the ramp."""
+
 REACHED_W = 1.0
 """A generator set-point this close is reached [W]."""
 
@@ -64,11 +69,17 @@ class HandoverState:
         mode: where it is.
         generator_w: set-point of the last command, NaN: what is observed counts [W].
         held: ticks for which what is applied was held, 0..:data:`HOLD_TICKS`.
+        step_w: the last change of that set-point along the ramp, 0 before the first [W].
+        observed_w: the generator as it was observed when that change was commanded [W].
+        waits: ticks for which it has not followed, 0..:data:`MOST_WAITS`.
     """
 
     mode: Mode = Mode.SHADOW
     generator_w: float = math.nan
     held: int = 0
+    step_w: float = 0.0
+    observed_w: float = math.nan
+    waits: int = 0
 
     @property
     def commanding(self) -> bool:
@@ -114,7 +125,29 @@ def limit_of(
         return None
     known = math.isfinite(state.generator_w)
     before_w = state.generator_w if known else float(observation.engine_power_w[0])
-    return ramp_limit(before_w, config.ramp_w_per_s, dt_s)
+    limit = ramp_limit(before_w, config.ramp_w_per_s, dt_s)
+    return (
+        RampLimit(before_w, 0.0) if limit is not None and _awaited(state, observation) else limit
+    )
+
+
+def _awaited(state: HandoverState, observation: Observation) -> bool:
+    """Less than half of the last step along the ramp is seen, and there is patience left."""
+    if state.mode is Mode.ENGAGED or abs(state.step_w) <= REACHED_W or state.waits >= MOST_WAITS:
+        return False
+    seen_w = float(observation.engine_power_w[0]) - state.observed_w
+    return seen_w / state.step_w < 0.5
+
+
+def _after(
+    state: HandoverState, mode: Mode, observation: Observation, generator_w: float
+) -> HandoverState:
+    """The state after a command on the way that asked for ``generator_w``."""
+    if _awaited(state, observation):
+        return replace(state, mode=mode, generator_w=generator_w, waits=state.waits + 1)
+    observed_w = float(observation.engine_power_w[0])
+    before_w = state.generator_w if math.isfinite(state.generator_w) else observed_w
+    return HandoverState(mode, generator_w, state.held, generator_w - before_w, observed_w)
 
 
 def hand_over(
@@ -155,7 +188,7 @@ def hand_over(
     if state.mode is Mode.ENGAGING and not reached:
         if made.mode is CommandMode.NOMINAL:
             made = replace(made, reason=Reason.HANDOVER)
-        return replace(state, generator_w=generator_w), made
+        return _after(state, Mode.ENGAGING, observation, generator_w), made
     return HandoverState(Mode.ENGAGED, generator_w, state.held), made
 
 
@@ -167,7 +200,7 @@ def _way_out(
     generator_w = set_point_w(observation, made)
     if abs(generator_w - set_point_w(observation, last)) <= REACHED_W:
         return HandoverState(), last
-    return replace(state, generator_w=generator_w), made
+    return _after(state, Mode.DISENGAGING, observation, generator_w), made
 
 
 def _ramped(

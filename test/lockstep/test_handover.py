@@ -95,12 +95,13 @@ def test_it_begins_at_what_is_applied_and_holds_until_everybody_hears():
 
 
 def test_it_is_engaged_once_the_wish_is_reached_and_then_jumps_as_the_policy_wants():
-    observation = seen(engine_w=120e3)
-    state = replace(ho.engage(HandoverState()), held=ho.HOLD_TICKS)
+    state, applied_w = replace(ho.engage(HandoverState()), held=ho.HOLD_TICKS), 120e3
     reasons = []
     for _ in range(4):
+        observation = seen(engine_w=applied_w)
         state, command = ho.hand_over(RAMP, state, observation, wish(observation, 0.0), 1.0)
         reasons.append(command.reason)
+        applied_w = ho.set_point_w(observation, command)
     assert state.mode is Mode.ENGAGED
     assert reasons == [Reason.HANDOVER, Reason.HANDOVER, Reason.NONE, Reason.NONE]
     state, command = ho.hand_over(RAMP, state, observation, wish(observation, 100e3), 1.0)
@@ -116,20 +117,23 @@ def test_ramp_always_holds_while_engaged_too():
 
 
 def test_engine_off_waits_for_the_ramp():
-    observation = seen(demand_w=30e3, engine_w=25e3)
-    state = replace(ho.engage(HandoverState()), held=ho.HOLD_TICKS)
-    off, powers = wish(observation, 30e3, 0.0), []
+    state, applied_w = replace(ho.engage(HandoverState()), held=ho.HOLD_TICKS), 25e3
+    powers = []
     for _ in range(3):
+        observation = seen(demand_w=30e3, engine_w=applied_w)
+        off = wish(observation, 30e3, 0.0)
         state, command = ho.hand_over(RAMP, state, observation, off, 1.0)
-        powers.append((ho.set_point_w(observation, command), command.engine_power_w == 0.0))
+        applied_w = ho.set_point_w(observation, command)
+        powers.append((applied_w, command.engine_power_w == 0.0))
     assert powers == [(15e3, False), (5e3, False), (0.0, True)]
 
 
 def test_it_leaves_with_the_fallback_law():
-    observation, state = seen(), HandoverState(Mode.DISENGAGING, 135e3)
+    observation, state = seen(engine_w=135e3), HandoverState(Mode.DISENGAGING, 135e3)
     state, command = ho.hand_over(RAMP, state, observation, wish(observation, 99e3), 1.0)
     assert (command.mode, command.reason) == (CommandMode.NOMINAL, Reason.HANDOVER)
     assert ho.set_point_w(observation, command) == pytest.approx(145e3)
+    observation = seen(engine_w=145e3)
     state, command = ho.hand_over(RAMP, state, observation, wish(observation, 99e3), 1.0)
     assert (command.mode, command.reason) == (CommandMode.FALLBACK, Reason.HANDOVER)
     assert command.battery_power_w == 0.0 and state == HandoverState()
@@ -171,6 +175,27 @@ def test_no_step_beyond_the_ramp_but_for_what_is_infeasible(events):
             most_w = max(abs(near - from_w), RAMP.ramp_w_per_s * 0.1) + ho.REACHED_W
             assert abs(power_w - from_w) <= most_w + ROUNDING_W
         applied_w = power_w
+
+
+def test_a_command_that_came_too_late_does_not_make_the_next_step_twice_as_large():
+    step_w, state = RAMP.ramp_w_per_s * 0.1, HandoverState(Mode.ENGAGING, 30e3, ho.HOLD_TICKS)
+    said_w = []
+    for applied_w in (30e3, 30e3, 30e3 + step_w, 30e3 + 2 * step_w):  # the first came too late
+        observation = seen(100e3, applied_w)
+        state, command = ho.hand_over(RAMP, state, observation, wish(observation, 0.0), 0.1)
+        said_w.append(ho.set_point_w(observation, command) - 30e3)
+    assert said_w == pytest.approx([step_w, step_w, 2 * step_w, 3 * step_w])
+
+
+@pytest.mark.parametrize("mode", [Mode.ENGAGING, Mode.DISENGAGING])
+def test_a_generator_that_never_follows_is_handed_over_all_the_same(mode):
+    state, ticks = HandoverState(mode, 0.0, ho.HOLD_TICKS), 0
+    while state.mode is mode:
+        observation = seen(20e3, 0.0)
+        state, _ = ho.hand_over(RAMP, state, observation, wish(observation, 0.0), 0.1)
+        ticks += 1
+        assert ticks < 100
+    assert ticks <= 20 * (1 + ho.MOST_WAITS)
 
 
 @dataclass(frozen=True)
