@@ -54,6 +54,11 @@ measure: $(STAMP)
 	$(BIN)/python test/nodes/measure_reactions.py --trials 50 --record reactions
 	$(BIN)/python test/nodes/measure_faults.py --trials 5 --record faults
 	$(BIN)/python test/nodes/measure_real_time.py --seconds 600 --record real_time
+	rm -rf out/measured
+	$(BIN)/python test/signals/vehicle_bag.py out/measured/v21
+	$(BIN)/ems train --bags out/measured/v21 --signals example_vehicle \
+	  --powertrain paper:dt_s=0.1 --out out/measured/tractor.safetensors
+	$(BIN)/python test/nodes/measure_real_time.py --seconds 600 --policy out/measured/tractor.safetensors --record learnt
 	$(BIN)/python test/nodes/measure_signals.py --trials 50 --record signals
 	$(BIN)/python test/nodes/measure_handover.py --trials 100 --record handover
 	$(BIN)/python test/nodes/measured_table.py

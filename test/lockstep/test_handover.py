@@ -295,7 +295,7 @@ def test_no_power_step_beyond_the_ramp_however_often_it_changes_hands(
     engaged = sum(
         b is Mode.ENGAGING and a is Mode.SHADOW for a, b in itertools.pairwise(road.modes)
     )
-    record_property("worst_step_w", max(steps))
+    record_property("worst_step_w", float(max(steps)))
     print(f"{kind}: {engaged} engagements, worst step {max(steps):.1f} W of 6000 W")
     assert engaged == times
     assert max(steps) <= 60e3 * 0.1 + ho.REACHED_W

@@ -28,6 +28,7 @@ SECTIONS = {
     "reactions": "measure_reactions.py --trials 50",
     "faults": "measure_faults.py --trials 5",
     "real_time": "measure_real_time.py --seconds 600",
+    "learnt": "measure_real_time.py --seconds 600 --policy out/measured/tractor.safetensors",
     "signals": "measure_signals.py --trials 50",
     "handover": "measure_handover.py --trials 100",
 }
