@@ -62,6 +62,7 @@ def drive(
             discharge_limit_w=limits.discharge_w,
             engine_limit_w=limits.engine_w,
             features=filters.values_w,
+            time_left_s=np.array([(steps - k) * dt_ns * 1e-9]),
         )
         asked, memory = policy.act(observation, memory)
         command = safe(observation, asked)

@@ -16,6 +16,7 @@ import numpy as np
 from tractor_msgs_py import topics
 from tractor_msgs_py.errors import BagError
 from tractor_msgs_py.types import (
+    MAX_STEPS,
     BatteryPowerCommand,
     BatteryReading,
     CommandMode,
@@ -50,9 +51,6 @@ POWERTRAIN_NAMES = (
 )
 _POWERTRAIN_FIELDS = tuple(field.name for field in dataclasses.fields(PowertrainReading))[1:]
 
-
-MAX_STEPS = 10_000_000
-"""Steps of the longest run: four months of seconds; readers build grids of this size."""
 
 MIN_DT_S, MAX_DT_S = 1e-3, 3600.0
 """Step lengths that can be announced [s]."""

@@ -1,9 +1,8 @@
 """From samples to what a policy sees: joining, demand filters, refusals.
 
 One :class:`ObservationBuilder` serves the live node, the bag reader and the in-process run.
-``exact`` joins samples of equal stamp; pairing "latest values" of two topics was measured wrong
-in 1.6-100 % of ticks. ``sampled`` reads a vehicle's signals, each at its own rate, at every tick
-of a clock. Filters live only here and reset with every run id.
+``exact`` joins samples of equal stamp; "latest values" of two topics were wrong in 1.6-100 % of
+ticks. ``sampled`` reads a vehicle's signals at every tick of a clock. Filters live only here.
 """
 
 import math
@@ -75,7 +74,7 @@ class ObservationSpec:
         dt_s: the step length the policy was made for [s]; None when any will do (``exact``).
         filters: demand filters, in the order of ``Observation.features``.
         mode: how samples are joined.
-        sampling: ``sampled``: how signals are read at a tick; a signal's own way for the others.
+        sampling: ``sampled``: how signals are read at a tick; others in their own way.
         lag_s: ``sampled``: how long a tick waits for samples on their way [s].
     """
 
@@ -150,6 +149,7 @@ class Observation:
         charge_limit_w, discharge_limit_w, engine_limit_w: present limits, magnitudes >= 0 [W];
             sampled: infinite where no signal says, for ``safety.within_powertrain`` to bound.
         features: filtered demand, shape (B, F) [W].
+        time_left_s: to the planned end of the work, (B,) or (1,) [s]; infinite where none is.
     """
 
     stamp_ns: int
@@ -163,6 +163,7 @@ class Observation:
     discharge_limit_w: FloatArray
     engine_limit_w: FloatArray
     features: FloatArray
+    time_left_s: FloatArray = field(default_factory=lambda: np.full(1, np.inf))
 
 
 @dataclass(frozen=True)
@@ -351,6 +352,7 @@ class ObservationBuilder:
                 discharge_limit_w=value("discharge_limit_w", math.inf),
                 engine_limit_w=value("engine_limit_w", math.inf),
                 features=self._filters.values_w.copy(),
+                time_left_s=np.array([run.time_left_s(frame.stamp_ns)]),
             ),
         )
 
@@ -397,4 +399,5 @@ class ObservationBuilder:
             discharge_limit_w=np.array([state.discharge_limit_w]),
             engine_limit_w=np.array([state.engine_limit_w]),
             features=self._filters.values_w.copy(),
+            time_left_s=np.array([run.time_left_s(sample.stamp_ns)]),
         )

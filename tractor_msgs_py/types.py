@@ -3,11 +3,16 @@
 One sample is one message. ``codec`` turns them into messages and back; nothing else does.
 """
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 
 DEFAULT_T0_NS = 1_000_000_000_000
 """Stamp of the first simulated tick: 1000 s, because stamp 0 means "unset" elsewhere in ROS."""
+
+MAX_STEPS = 10_000_000
+"""Steps of the longest run: four months of seconds; readers build grids of this size. A run of
+as many has no planned end."""
 
 
 class CommandMode(IntEnum):
@@ -144,6 +149,12 @@ class RunInfo:
     def stamp_ns(self, k: int) -> int:
         """Stamp of tick ``k`` [ns]."""
         return self.t0_ns + k * self.dt_ns
+
+    def time_left_s(self, stamp_ns: int) -> float:
+        """From a stamp to the planned end; infinite where the run has none (``MAX_STEPS``)."""
+        if self.steps >= MAX_STEPS:
+            return math.inf
+        return max(self.stamp_ns(self.steps) - stamp_ns, 0) * 1e-9
 
 
 @dataclass(frozen=True, slots=True)

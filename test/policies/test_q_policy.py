@@ -10,8 +10,9 @@ import pytest
 
 from tractor_ems.drive import drive
 from tractor_ems.learning.rewards import RewardConfig, resolve
+from tractor_ems.policies.made import check_powertrain
 from tractor_ems.policies.mlp import Mlp
-from tractor_ems.policies.q_policy import Normalisation, QPolicy, check_powertrain, own_limits
+from tractor_ems.policies.q_policy import Normalisation, QPolicy, own_limits
 from tractor_msgs_py.errors import PolicyError
 from tractor_msgs_py.observation import DemandFilter, Observation, ObservationSpec
 from tractor_sim.config import load_powertrain

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tractor_ems.nodes.policy_node import PolicySetup, run_policy_node
-from tractor_ems.policies.q_policy import load_policy
+from tractor_ems.policies.made import load_made
 from tractor_msgs_py.ros.shell import Parameter
 from tractor_sim.powertrain_json import powertrain_hash
 from tractor_sim.resources import resource_path
@@ -24,7 +24,7 @@ def prepare(values: Mapping[str, Any]) -> PolicySetup:
     """The policy in the named file, or the one that ships."""
     named = values["policy_file"]
     path = Path(named) if named else resource_path("data", "policy", "paper.safetensors")
-    policy = load_policy(path)
+    policy = load_made(path)
     return PolicySetup(policy, powertrain_hash(policy.params), params=policy.params)
 
 

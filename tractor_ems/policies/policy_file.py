@@ -1,12 +1,12 @@
-"""The policy file format: safetensors weights and one JSON document. What it means is
-``q_policy``'s business.
+"""The policy file format: safetensors weights and one JSON document. What they mean is the
+business of the policies, whose kind is the document's ``kind``; see ``made``.
 """
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -14,7 +14,11 @@ from safetensors.numpy import save
 
 from tractor_ems.policies.mlp import Float32Array
 from tractor_msgs_py.atomic import write_bytes
-from tractor_msgs_py.errors import PolicyError
+from tractor_msgs_py.errors import ConfigError, PolicyError
+from tractor_sim.powertrain import PowertrainParams
+from tractor_sim.powertrain_json import params_from_json, powertrain_hash
+
+Made = TypeVar("Made")
 
 FORMAT_VERSION = 1
 _KEY = "tractor_ems.policy"
@@ -79,6 +83,34 @@ def read_policy_file(path: Path) -> tuple[dict[str, Float32Array], dict[str, Any
         if tensor.dtype != np.float32 or not np.all(np.isfinite(tensor)):
             raise PolicyError(f"{path}: {name} must be finite float32, is {_describe(tensor)}")
     return tensors, metadata
+
+
+def read_policy(
+    path: Path, make: Callable[[dict[str, Float32Array], dict[str, Any]], Made]
+) -> Made:
+    """What ``make`` makes of a file's tensors and metadata.
+
+    Raises:
+        PolicyError: as :func:`read_policy_file`, or ``make`` found that they do not fit.
+    """
+    tensors, metadata = read_policy_file(path)
+    try:
+        return make(tensors, metadata)
+    except (PolicyError, ConfigError) as error:
+        raise PolicyError(f"{path}: {error}") from None
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise PolicyError(f"{path}: metadata is not a policy's ({error!r})") from None
+
+
+def params_of(metadata: Mapping[str, Any]) -> PowertrainParams:
+    """The powertrain that a policy was made for.
+
+    Raises PolicyError or ConfigError where it is damaged, KeyError where there is none.
+    """
+    params = params_from_json(metadata["powertrain"])
+    if powertrain_hash(params) != metadata["powertrain_hash"]:
+        raise PolicyError("powertrain parameters do not match their hash")
+    return params
 
 
 def _describe(tensor: np.ndarray[Any, Any]) -> str:

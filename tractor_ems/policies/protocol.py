@@ -5,7 +5,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from tractor_msgs_py.observation import Observation, ObservationSpec
-from tractor_sim.powertrain import Command, PowerLimits
+from tractor_sim.powertrain import Command, PowerLimits, PowertrainParams
 
 ANY_RUN = ObservationSpec()
 """The spec of a policy that needs no filters and runs at any step length."""
@@ -27,6 +27,18 @@ class Policy(Protocol):
 
     def act(self, observation: Observation, state: Any) -> tuple[Command, Any]:
         """The command for every run of the batch, and the next state. Never mutates ``state``."""
+
+
+class MadePolicy(Policy, Protocol):
+    """A policy out of a file: it was made for one powertrain and says from what."""
+
+    @property
+    def params(self) -> PowertrainParams:
+        """The powertrain it was made for."""
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """Where it came from, as stored in its file."""
 
 
 def limits_of(observation: Observation) -> PowerLimits:

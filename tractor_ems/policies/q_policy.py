@@ -12,9 +12,9 @@ import numpy as np
 from tractor_ems.learning.rewards import RewardConfig, battery_price, running_cost, start_cost
 from tractor_ems.policies.action_grid import feasible_range, in_range
 from tractor_ems.policies.mlp import Float32Array, Mlp, forward
-from tractor_ems.policies.policy_file import read_policy_file, write_policy_file
+from tractor_ems.policies.policy_file import params_of, read_policy, write_policy_file
 from tractor_ems.policies.protocol import limits_of
-from tractor_msgs_py.errors import ConfigError, PolicyError
+from tractor_msgs_py.errors import PolicyError
 from tractor_msgs_py.observation import Observation, ObservationSpec
 from tractor_msgs_py.trajectory import BoolArray, FloatArray
 from tractor_sim.battery import soc_after
@@ -28,7 +28,7 @@ from tractor_sim.powertrain import (
     power_limits,
     project,
 )
-from tractor_sim.powertrain_json import params_from_json, params_to_json, powertrain_hash
+from tractor_sim.powertrain_json import params_to_json, powertrain_hash
 
 Kind = Literal["ddqn_counterfactual", "ddqn_sampled"]
 KINDS: tuple[Kind, ...] = ("ddqn_counterfactual", "ddqn_sampled")
@@ -296,29 +296,20 @@ def save_policy(path: Path, policy: QPolicy) -> None:
 
 
 def load_policy(path: str | Path) -> QPolicy:
-    """Read a policy file.
+    """Read a policy file of one of :data:`KINDS`; ``made.load_made`` reads those of every kind.
 
     Raises:
         PolicyError: the file is missing, cut short, not a policy file, of an unknown version or
             kind, damaged, or its tensors do not have the shapes its metadata promises.
     """
-    path = Path(path)
-    tensors, data = read_policy_file(path)
-    try:
-        return _policy_from(tensors, data)
-    except (PolicyError, ConfigError) as error:
-        raise PolicyError(f"{path}: {error}") from None
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise PolicyError(f"{path}: metadata is not a policy's ({error!r})") from None
+    return read_policy(Path(path), policy_from)
 
 
-def _policy_from(tensors: dict[str, Float32Array], data: dict[str, Any]) -> QPolicy:
+def policy_from(tensors: dict[str, Float32Array], data: dict[str, Any]) -> QPolicy:
     kind = data["kind"]
     if kind not in KINDS:
         raise PolicyError(f"kind {kind!r}, allowed {', '.join(KINDS)}")
-    params = params_from_json(data["powertrain"])
-    if powertrain_hash(params) != data["powertrain_hash"]:
-        raise PolicyError("powertrain parameters do not match their hash")
+    params = params_of(data)
     layers = _count(data["network"], "layers", 1, LAYERS_MAX)
     names = {f"layer{n}.{part}" for n in range(layers) for part in ("weight", "bias")}
     if set(tensors) != names:
@@ -356,17 +347,3 @@ def _count(data: dict[str, Any], name: str, least: int, most: int) -> int:
     if type(value) is not int or not least <= value <= most:
         raise PolicyError(f"{name}: {reprlib.repr(value)}, allowed whole numbers {least}..{most}")
     return value
-
-
-def check_powertrain(policy: QPolicy, expected_hash: str) -> None:
-    """Refuse a policy that was made for another powertrain.
-
-    Raises:
-        PolicyError: the hashes differ.
-    """
-    own = powertrain_hash(policy.params)
-    if own != expected_hash:
-        raise PolicyError(
-            f"policy {policy.name} was made for powertrain {policy.params.name} "
-            f"({own[:12]}), this one is {expected_hash[:12]}"
-        )

@@ -94,9 +94,9 @@ def make_policy(
         return solve_policy(
             params, scenario.power_demand_w, scenario.soc_initial, scenario.soc_target
         )
-    from tractor_ems.policies.q_policy import check_powertrain, load_policy
+    from tractor_ems.policies.made import check_powertrain, load_made
 
-    policy = load_policy(policy_file(name, params.name))
+    policy = load_made(policy_file(name, params.name))
     if not allow_other_powertrain:
         check_powertrain(policy, powertrain_hash(params))
     return policy

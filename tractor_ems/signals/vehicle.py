@@ -5,12 +5,12 @@ run of a vehicle that announces none, the values in a message, the sampling that
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from tractor_msgs_py.codec import MAX_STEPS, stamp_to_ns
+from tractor_msgs_py.codec import stamp_to_ns
 from tractor_msgs_py.errors import BagError
 from tractor_msgs_py.observation import SAMPLED_SIGNALS, DemandFilter, ObservationSpec
 from tractor_msgs_py.sampling import LAG_S, Sampling
 from tractor_msgs_py.signals import SIGNALS, SignalMap, Source
-from tractor_msgs_py.types import RunInfo
+from tractor_msgs_py.types import MAX_STEPS, RunInfo
 
 
 def vehicle_run(dt_s: float, soc_target: float, run_id: str = "vehicle") -> RunInfo:
