@@ -33,18 +33,18 @@ def low_passed(demand_w, time_s):
 @pytest.mark.slow
 def test_the_compiled_ecms_drives_as_the_policy_does():
     demand_w = work(600)
-    policy = AEcms(FIELD, equivalence=2.42, adapt=0.05, write_off_s=60.0)
+    policy = AEcms(FIELD, equivalence=2.42, adapt=0.05, write_off_s=60.0, stiffen_s=40.0)
     run = drive(policy, FIELD, demand_w[None, :], 0.55, 0.55)[0]
     settings = np.array([
         policy.equivalence / FIELD.engine.fuel_lhv_j_per_kg, policy.soc_gain, policy.adapt,
-        FIELD.engine.start_fuel_kg / policy.write_off_s, 0.0, 0.0, 0.0,
+        FIELD.engine.start_fuel_kg / policy.write_off_s, 0.0, policy.stiffen_s,
     ])  # fmt: skip
     most_w = power_max_w(FIELD)
     fuel_kg = running_fuel_kg_per_s(FIELD, np.linspace(0.0, most_w, 4097)) * FIELD.dt_s
     totals = np.zeros(9)
     closed_loop.drive_ecms(
-        *batch_plant(FIELD), CELL, fuel_kg, most_w, demand_w, low_passed(demand_w, 20.0), 0.55,
-        0.55, settings, totals, np.zeros((0, 3)),
+        *batch_plant(FIELD), CELL, fuel_kg, most_w, demand_w, low_passed(demand_w, 20.0),
+        np.arange(600.0, 0.0, -1.0), 0.55, 0.55, settings, totals, np.zeros((0, 3)),
     )  # fmt: skip
     assert totals[closed_loop.FUEL] == pytest.approx(run.fuel_kg.sum(), rel=1e-4)
     assert totals[closed_loop.SOC_FINAL] == pytest.approx(run.soc_final, abs=1e-4)

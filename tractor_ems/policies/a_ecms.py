@@ -23,6 +23,9 @@ from tractor_sim.powertrain import Command, PowertrainParams
 
 ADAPT_EVERY_S = 60.0
 
+BEND_MOST = 1.0
+"""Most that SOC feedback raises or lowers the price, relative to it."""
+
 
 @dataclass(frozen=True)
 class AEcmsState:
@@ -37,17 +40,24 @@ class AEcmsState:
 class AEcms:
     """Minimises LHV fuel + s V_oc I at every step, as ``ecms``, with the engine free to stop:
 
-        s = equivalence (1 + soc_gain e + sum over minutes of adapt e),   e = SOC_target - SOC
+        s = equivalence (1 + (soc_gain + stiffen_s / time left) e + sum over minutes of adapt e),
+        e = SOC_target - SOC
 
     Whether to run is asked of demand smoothed over ``decide_s``: the engine starts (stops) when
     running (standing) is cheaper by more than the start's fuel / ``write_off_s``.
+
+    A relative rise of the price by x moves the battery by x V_oc^2 / 2R (2.6 MW on "field"), and
+    paying an error e back in the time left t takes E e / t: stiffen_s = 2 R E / V_oc^2, 55 s on
+    "field", would just do that; below it SOC swings freely until late.
 
     Attributes:
         powertrain: what it drives.
         equivalence: fuel energy per battery energy at the target SOC, > 0.
         soc_gain, adapt: relative rise of that per unit of SOC below the target, and per minute.
-        write_off_s: time over which a start is written off, > 0 [s].
-        decide_s: time constant of the demand that decides on starts and stops, > 0 [s].
+        write_off_s: time over which a start is written off, > 0 [s]; inf: starts count nothing.
+        decide_s: time constant of the demand that decides on starts and stops [s]; 0: the
+            present demand does.
+        stiffen_s: how the gain grows towards the planned end, >= 0 [s]; 0: knows of no end.
 
     Raises PolicyError where a setting is out of range.
     """
@@ -58,21 +68,26 @@ class AEcms:
     adapt: float = 0.0
     write_off_s: float = 120.0
     decide_s: float = 20.0
+    stiffen_s: float = 0.0
     name: str = "a_ecms"
 
     def __post_init__(self) -> None:
-        for name in ("equivalence", "write_off_s", "decide_s"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise PolicyError(f"a_ecms.{name}: {value}, allowed finite and > 0")
-        for name in ("soc_gain", "adapt"):
+        if not (np.isfinite(self.equivalence) and self.equivalence > 0):
+            raise PolicyError(
+                f"{self.name}.equivalence: {self.equivalence}, allowed finite and > 0"
+            )
+        if not self.write_off_s > 0:
+            raise PolicyError(f"{self.name}.write_off_s: {self.write_off_s}, allowed > 0")
+        for name in ("soc_gain", "adapt", "decide_s", "stiffen_s"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
-                raise PolicyError(f"a_ecms.{name}: {value}, allowed finite and >= 0")
+                raise PolicyError(f"{self.name}.{name}: {value}, allowed finite and >= 0")
 
     @property
     def spec(self) -> ObservationSpec:
         """Smoothed demand comes as the observation's only feature."""
+        if self.decide_s == 0.0:
+            return ObservationSpec()
         return ObservationSpec(filters=(DemandFilter("low_pass", self.decide_s),))
 
     def init(self, batch: int) -> AEcmsState:
@@ -86,7 +101,9 @@ class AEcms:
         every = round(ADAPT_EVERY_S / params.dt_s)
         due = state.ticks > 0 and state.ticks % every == 0
         raised = state.raised + (self.adapt * error if due else 0.0)
-        price = self.equivalence * (1.0 + self.soc_gain * error + raised)
+        gain = self.soc_gain + self.stiffen_s / np.maximum(observation.time_left_s, params.dt_s)
+        bend = np.clip(gain * error + raised, -BEND_MOST, BEND_MOST)
+        price = self.equivalence * (1.0 + bend)
         kg_per_j = price[:, None] / params.engine.fuel_lhv_j_per_kg
         column = soc[:, None]
         ocv_v = open_circuit_v(params.battery, column)
@@ -99,7 +116,8 @@ class AEcms:
         demand_w = observation.power_demand_w
         least_w, most_w, may_run, may_be_off = running_range_w(params, observation)
         engine_w, _ = cheapest(params, demand_w, least_w, most_w, after)
-        slow_w = np.minimum(observation.features[:, 0], observation.discharge_limit_w)
+        seen_w = observation.features[:, 0] if self.decide_s > 0.0 else demand_w
+        slow_w = np.minimum(seen_w, observation.discharge_limit_w)
         wide = unhurried_range_w(params, slow_w, observation)
         _, run_kg = cheapest(params, slow_w, *wide, after)
         still_kg = after(slow_w[:, None])[:, 0]
