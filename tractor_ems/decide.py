@@ -12,8 +12,11 @@ from typing import Any
 import numpy as np
 
 from tractor_ems import handover as ho
+from tractor_ems import planned_end
+from tractor_ems.envelope_watch import OUTSIDE_S, EnvelopeState, signals_of, watched
 from tractor_ems.handover import HandoverConfig, HandoverState, Mode
 from tractor_ems.plausible import Seen, judge, plausible_on
+from tractor_ems.policies.envelope import Envelope
 from tractor_ems.policies.protocol import Policy
 from tractor_ems.safety import (
     fallback_command,
@@ -43,6 +46,10 @@ class DecideConfig:
         shadow: begin in the shadow instead of engaged.
         params: the policy's powertrain; None: neither plausibility nor limits of its own.
         vehicle: published limits may be missing, so the powertrain's own hold too.
+        envelope: what the policy saw in training; None: not known.
+        outside_fallback: the fallback law holds while observations are away from that, for
+            longer than ``outside_s``; not in lockstep.
+        outside_s: how long outside that is, >= 0 [s].
     """
 
     timeout_s: float = 2.0
@@ -50,6 +57,9 @@ class DecideConfig:
     shadow: bool = False
     params: PowertrainParams | None = None
     vehicle: bool = False
+    envelope: Envelope | None = None
+    outside_fallback: bool = False
+    outside_s: float = OUTSIDE_S
 
 
 @dataclass(frozen=True)
@@ -98,12 +108,17 @@ class Decider:
         complaint: the last text about an implausible observation.
         trouble: what the policy raised, empty where it did not.
         reasons: bad observations and answers by reason, of all runs.
+        plan: the end of the work as the operator plans it.
+        envelope: whether observations are outside what the policy was trained on.
+        outside_ticks: observations outside by signal, of all runs.
     """
 
     def __init__(self, policy: Policy, config: DecideConfig) -> None:
         self.policy, self.config = policy, config
         self.corrected = self.fallbacks = 0
         self.reasons: Counter[str] = Counter()
+        self.outside_ticks: Counter[str] = Counter()
+        self.plan = planned_end.PlannedEnd()
         self.handover = HandoverState(Mode.SHADOW if config.shadow else Mode.ENGAGED)
         self._plausible = None if config.params is None else plausible_on(config.params)
         self.start(1.0, supervised=False)
@@ -121,6 +136,8 @@ class Decider:
         self._seen = Seen()
         self._observation: Observation | None = None
         self._said_s, self._said_in = -np.inf, Condition.INIT
+        self.envelope = EnvelopeState()
+        self.plan_work(self.plan.work_s)
         self.handover = replace(self.handover, generator_w=np.nan)
         self.clear()
 
@@ -146,6 +163,7 @@ class Decider:
         self.start(dt_s, supervised=True)
         self.decide(made_up, 0.0)
         self.handover, self.corrected, self.fallbacks, self.reasons = before
+        self.outside_ticks.clear()
         self.start(dt_s, supervised=False)
 
     def clear(self) -> None:
@@ -157,7 +175,17 @@ class Decider:
         """The vehicle's clock was set back: nothing that was remembered is of this time, and
         trust must be earned again. FAULT stays, and so does who drives."""
         self._memory, self._seen = self.policy.init(1), Seen()
+        self.plan = planned_end.paused(self.plan)
         self.trust = supervisor.lost(self.trust, Reason.OBSERVATION_STALE)
+
+    def plan_work(self, work_s: float) -> None:
+        """The work ends this long after the next observation; 0: when the run says [s]."""
+        self.plan = planned_end.planned(work_s)
+
+    @property
+    def away(self) -> bool:
+        """True where the fallback law holds because the policy knows nothing like this."""
+        return self.config.outside_fallback and self._supervised and self.envelope.away
 
     @property
     def mode(self) -> Mode:
@@ -202,7 +230,7 @@ class Decider:
         params, command, corrected = self.config.params, None, False
         if self.config.vehicle and params is not None:
             observation = within_powertrain(observation, params, self._dt_s)
-        self._observation = observation
+        observation = self._noted(observation)
         try:
             command, self._memory = self.policy.act(observation, self._memory)
         except Exception as error:  # any: a driver that fails must be replaced, not mourned
@@ -214,6 +242,9 @@ class Decider:
         if command is None or not self.trust.nominal:
             self.fallbacks += self.handover.commanding
             wish = vehicle_fallback(observation, self._reason())
+        elif self.away:
+            self.fallbacks += self.handover.commanding
+            wish = vehicle_fallback(observation, Reason.OUTSIDE_ENVELOPE)
         else:
             made = vehicle_command if self.config.vehicle else safe_command
             wish, corrected = made(observation, command)
@@ -229,11 +260,22 @@ class Decider:
                 self.clear()
         return Decision(observation, wish, sent, applied)
 
+    def _noted(self, observation: Observation) -> Observation:
+        """An observation that is decided on: with the planned end, and watched."""
+        self.plan, observation = planned_end.counted(self.plan, observation)
+        if self.config.envelope is not None:
+            self.envelope = watched(
+                self.config.envelope, self.config.outside_s, self.envelope, observation, self._dt_s
+            )
+            self.outside_ticks.update(signals_of(self.envelope.outside))
+        self._observation = observation
+        return observation
+
     def _said(self, now_s: float) -> None:
         self._said_s, self._said_in = now_s, self.trust.condition
 
     def _unsupervised(self, observation: Observation, applied: Applied) -> Decision:
-        self._observation = observation
+        observation = self._noted(observation)
         command, self._memory = self.policy.act(observation, self._memory)
         wish, corrected = safe_command(observation, command)
         self.corrected += corrected
@@ -294,6 +336,10 @@ class Decider:
             raise PolicyError(f"{said}; {detail}" if detail else said)
         if self.mode in (Mode.ENGAGING, Mode.ENGAGED):
             return f"already {self.mode.name.lower()}"
+        if self.away:
+            raise PolicyError(f"outside what the policy was trained on: {self.envelope.text}")
+        if self.mode is Mode.SHADOW:
+            self.plan_work(self.plan.work_s)
         self.handover = ho.engage(self.handover)
         now_w = float(self._observation.engine_power_w[0])
         return f"engaging from {now_w:.0f} W, at most {self._ramp_text()}"

@@ -1,5 +1,6 @@
 """What a policy's node tells people: diagnostics, a line at the end, a JSON file. Pure."""
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -56,6 +57,8 @@ def state_of(answers: Answers) -> str:
     mode, trust = decider.mode.name.lower(), decider.trust
     driving = "driving" if decider.handover.commanding else "following"
     if trust.condition in (Condition.INIT, Condition.NOMINAL):
+        if decider.away:
+            return f"{driving}, fallback law: outside what the policy was trained on"
         return driving if mode in ("engaged", "shadow") else f"{driving}, {mode}"
     return supervisor.describe(trust)
 
@@ -88,11 +91,34 @@ def values_of(
     for name, text in (("implausible", decider.complaint), ("policy_error", decider.trouble)):
         if text:
             values[name] = text
+    values |= _envelope_values(decider) | _planned_values(decider)
     if log is not None:
         values["shadow_log"] = log.sum.line
         if log.trouble:
             values["shadow_log_error"] = log.trouble
     return values
+
+
+def _envelope_values(decider: Decider) -> dict[str, object]:
+    """What lies, or lay a moment ago, outside what the policy was trained on, and how often."""
+    if decider.config.envelope is None:
+        return {}
+    watch, counted = decider.envelope, sorted(decider.outside_ticks.items())
+    said = "away" if watch.away else "outside" if watch.suspect else "inside"
+    values: dict[str, object] = {"envelope": said}
+    if watch.suspect:
+        values["outside_envelope"] = watch.text
+    return values | {f"outside_{signal}": count for signal, count in counted}
+
+
+def _planned_values(decider: Decider) -> dict[str, object]:
+    """The planned end, where there is one."""
+    seen, work_s = decider.observation, decider.plan.work_s
+    values: dict[str, object] = {"planned_work_s": work_s} if work_s else {}
+    if decider.plan.passed:
+        return values | {"time_left_s": 0.0, "planned_end": "passed: holding the SOC target"}
+    left_s = math.inf if seen is None else float(seen.time_left_s[0])
+    return values | ({"time_left_s": left_s} if math.isfinite(left_s) else {})
 
 
 def warns(
@@ -103,6 +129,7 @@ def warns(
     trusted = decider.trust.condition in (Condition.INIT, Condition.NOMINAL)
     doubled = others > 0 and decider.handover.commanding
     spoken = decider.corrected > 0 or decider.fallbacks > 0
+    spoken |= decider.envelope.suspect
     lacking = bool(getattr(answers, "missing", {})) or (log is not None and log.trouble != "")
     return doubled or spoken or lacking or bool(mismatches) or not trusted
 

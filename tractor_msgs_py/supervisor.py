@@ -45,6 +45,7 @@ REASON_TEXT = {
     Reason.SHUTDOWN: "the policy is shutting down",
     Reason.HANDOVER: "the drive is being handed over, or two policies are connected",
     Reason.COMMAND_STALE: "commands stopped or are too old",
+    Reason.OUTSIDE_ENVELOPE: "observations are outside what the policy was trained on",
 }
 """Each reason in words, for diagnostics."""
 

@@ -36,6 +36,7 @@ class Reason(IntEnum):
     SHUTDOWN = 7
     HANDOVER = 8
     COMMAND_STALE = 9
+    OUTSIDE_ENVELOPE = 10
 
 
 @dataclass(frozen=True, slots=True)

@@ -99,7 +99,7 @@ def test_a_powertrain_with_changed_settings_stays_one_name(capsys, cycles):
         (("--policy", "conventional,"), "empty name"),
         (("--policy", "conventional,dp", "--record", "bag"), "--record"),
         (("--policy", "conventional,dp", "--plot", "a.png"), "--plot"),
-        (("--policy", "conventional,default", "--powertrain", "field"), "none ships"),
+        (("--policy", "conventional,default", "--powertrain", "wheel_loader"), "none ships"),
         (("--jobs", "0", "--policy", "conventional,dp"), "--jobs"),
     ],
 )

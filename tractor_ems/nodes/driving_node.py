@@ -107,6 +107,8 @@ class DrivingNode(ABC):
         decider = self._answers.decider
         if "soc_target" in values:
             self._answers.aim(soc_target_of(values["soc_target"]))
+        if "planned_work_s" in values:
+            decider.plan_work(values["planned_work_s"])
         decider.config = changed(decider.config, values)
         self._pace_watch()
 

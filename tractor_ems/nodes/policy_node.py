@@ -12,11 +12,12 @@ from rclpy.node import Node
 
 from tractor_ems.answer import Answerer, Observed
 from tractor_ems.nodes.driving_node import DrivingNode
-from tractor_ems.nodes.policy_parameters import COMMON, SOC_TARGET
+from tractor_ems.nodes.policy_of_run import PolicyOfRun
+from tractor_ems.nodes.policy_parameters import COMMON, PLANNED_WORK, SOC_TARGET
 from tractor_ems.nodes.policy_setup import Paperwork, PolicySetup, answerer_of, papers_of
 from tractor_msgs_py import topics
 from tractor_msgs_py.codec import decode_battery, decode_power_demand, decode_powertrain
-from tractor_msgs_py.ros.shell import Parameter, run_node
+from tractor_msgs_py.ros.shell import Logic, Parameter, run_node
 from tractor_msgs_py.ros.wire import arrived_ns, subscribe_to
 
 __all__ = ["COMMON", "PolicyNode", "PolicySetup", "run_policy_node"]
@@ -31,13 +32,28 @@ OBSERVED: tuple[tuple[topics.Topic, Callable[[Any], Observed]], ...] = (
 def run_policy_node(
     name: str,
     parameters: Sequence[Parameter],
-    prepare: Callable[[Mapping[str, Any]], PolicySetup],
+    prepare: Callable[[Mapping[str, Any]], PolicySetup | None],
 ) -> int:
-    """Run one policy until a signal arrives; returns the exit code of ``run_node``."""
-    aimed = any(parameter.name == SOC_TARGET.name for parameter in parameters)
+    """Run one policy until a signal arrives; returns the exit code of ``run_node``.
 
-    def build(node: Node, values: Mapping[str, Any]) -> DrivingNode:
+    Args:
+        name: of the node.
+        parameters: of its own.
+        prepare: the policy that its values ask for; None: the first run must say which
+            powertrain it has, and ``prepare`` is asked again with its name.
+    """
+    solved = any(parameter.name == SOC_TARGET.name for parameter in parameters)
+
+    def begin(node: Node, values: Mapping[str, Any]) -> Logic:
         setup = prepare(values)
+        return PolicyOfRun(node, values, chosen) if setup is None else build(node, values, setup)
+
+    def chosen(node: Node, values: Mapping[str, Any]) -> DrivingNode:
+        setup = prepare(values)
+        assert setup is not None, "a powertrain is named"
+        return build(node, values, setup)
+
+    def build(node: Node, values: Mapping[str, Any], setup: PolicySetup) -> DrivingNode:
         answerer = answerer_of(setup, values)
         papers = papers_of(setup, answerer, values)
         if isinstance(answerer, Answerer):
@@ -46,7 +62,9 @@ def run_policy_node(
 
         return VehicleNode(node, answerer, values["history_depth"], papers)
 
-    return run_node(name, (*parameters, *COMMON, *(() if aimed else (SOC_TARGET,))), build)
+    return run_node(
+        name, (*parameters, *COMMON, *(() if solved else (SOC_TARGET, PLANNED_WORK))), begin
+    )
 
 
 class PolicyNode(DrivingNode):

@@ -1,5 +1,6 @@
 """The parameters that every policy node has, each with unit and range. Nothing else."""
 
+from tractor_ems.envelope_watch import OUTSIDE_S
 from tractor_ems.handover import DEFAULT_RAMP_W_PER_S
 from tractor_msgs_py.ros.shell import Parameter
 from tractor_msgs_py.ros.wire import HISTORY_DEPTH
@@ -63,6 +64,17 @@ COMMON = (
     HISTORY_DEPTH,
 )
 
+PLANNED_WORK = Parameter(
+    "planned_work_s",
+    0.0,
+    "the work ends so long after this is set, the policy is engaged or the run begins, 0 for "
+    "when the run says",
+    "s",
+    0,
+    1e7,
+    dynamic=True,
+)
+
 SOC_TARGET = Parameter(
     "soc_target",
     UNSET,
@@ -72,4 +84,25 @@ SOC_TARGET = Parameter(
     1,
     dynamic=True,
 )
-"""Of every policy that has not solved its run for a target of its own."""
+"""This and the planned end are of every policy that has not solved its run."""
+
+OUTSIDE = (
+    Parameter(
+        "outside_envelope",
+        "warn",
+        "demand or SOC outside what the policy was trained on: only warn, or real time: let the "
+        "fallback law hold",
+        choices=("warn", "fallback"),
+        dynamic=True,
+    ),
+    Parameter(
+        "outside_envelope_s",
+        OUTSIDE_S,
+        "how long outside that is, and how long inside until the policy drives again",
+        "s",
+        0,
+        3600,
+        dynamic=True,
+    ),
+)
+"""Of policies that know what they were trained on."""

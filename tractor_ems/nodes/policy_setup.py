@@ -11,6 +11,7 @@ from tractor_ems.answer import Answerer, RunCheck
 from tractor_ems.decide import DecideConfig
 from tractor_ems.drive_report import write_report
 from tractor_ems.handover import HandoverConfig
+from tractor_ems.policies.envelope import Envelope
 from tractor_ems.policies.protocol import Policy
 from tractor_ems.shadow_log import ShadowLog, price_of
 from tractor_msgs_py.errors import ConfigError
@@ -29,12 +30,14 @@ class PolicySetup:
         powertrain_hash: the powertrain it was made for; None when any will do.
         check_run: raises where the policy must not drive a run.
         params: that powertrain; on a vehicle its limits and plausible values hold.
+        envelope: what the policy saw in training; None: not known.
     """
 
     policy: Policy
     powertrain_hash: str | None = None
     check_run: RunCheck | None = None
     params: PowertrainParams | None = None
+    envelope: Envelope | None = None
 
 
 def handover_of(
@@ -55,6 +58,10 @@ def changed(config: DecideConfig, values: Mapping[str, Any]) -> DecideConfig:
         always = config.handover.always
         ramped = handover_of(config.params, values["ramp_w_per_s"], always)
         config = replace(config, handover=ramped)
+    if "outside_envelope" in values:
+        config = replace(config, outside_fallback=values["outside_envelope"] == "fallback")
+    if "outside_envelope_s" in values:
+        config = replace(config, outside_s=values["outside_envelope_s"])
     return config
 
 
@@ -75,7 +82,17 @@ def answerer_of(setup: PolicySetup, values: Mapping[str, Any]) -> "Answerer | Sa
         handover_of(setup.params, values["ramp_w_per_s"], values["ramp_always"]),
         values["shadow"],
         setup.params,
+        envelope=setup.envelope,
     )
+    outside = {name: value for name, value in values.items() if name.startswith("outside_")}
+    answerer = _answerer(setup, changed(config, outside), made_for, values)
+    answerer.decider.plan_work(values.get("planned_work_s", 0.0))
+    return answerer
+
+
+def _answerer(
+    setup: PolicySetup, config: DecideConfig, made_for: str | None, values: Mapping[str, Any]
+) -> "Answerer | SampledAnswerer":
     named, policy, check = values["signals"], setup.policy, setup.check_run
     if not named and policy.spec.mode == "exact":
         target = (

@@ -6,11 +6,11 @@ from tractor_ems.policies.ecms import NeverStopEcms
 from tractor_ems.policies.levelling import LoadLevelling
 from tractor_ems.policies.protocol import Policy
 from tractor_ems.policies.rules import BestPoint, Conventional, MyopicGreedy, RuleBased
+from tractor_ems.policies.shipped import shipped_policy
 from tractor_ems.scenario import Scenario
 from tractor_msgs_py.errors import PolicyError
 from tractor_sim.powertrain import PowertrainParams
 from tractor_sim.powertrain_json import powertrain_hash
-from tractor_sim.resources import resource_path
 
 RULES = (
     "conventional",
@@ -32,10 +32,7 @@ def policy_file(name: str, powertrain: str) -> Path:
         PolicyError: no policy ships for that powertrain, or the name is unknown.
     """
     if name == "default":
-        path = resource_path("data", "policy") / f"{powertrain}.safetensors"
-        if not path.is_file():
-            raise PolicyError(f"policy default: none ships for powertrain {powertrain!r}")
-        return path
+        return shipped_policy(powertrain)
     if not name.endswith(".safetensors"):
         raise PolicyError(
             f"policy {name!r}: unknown, names are {', '.join(NAMES)}; or give a .safetensors file"
