@@ -126,9 +126,9 @@ def drive_table(
 def drive_choice(
     plant: Plant, knots: FloatArray, segments: Segments, cell: Cell, fuel_kg: FloatArray,
     engine_max_w: float, demand_w: FloatArray, inputs: FloatArray, stiff_kg: FloatArray,
-    soc0: float, target: float, price_kg: float, start_kg: float, unit_kg: float, soc_scale: float, slope_step: float,
-    w0: FloatArray, b0: FloatArray, w1: FloatArray, b1: FloatArray, w2: FloatArray,
-    b2: FloatArray, totals: FloatArray, trace: FloatArray,
+    soc0: float, target: float, price_kg: float, start_kg: float, unit_kg: float,
+    soc_scale: float, slope_step: float, w0: FloatArray, b0: FloatArray, w1: FloatArray,
+    b1: FloatArray, w2: FloatArray, b2: FloatArray, totals: FloatArray, trace: FloatArray,
 ) -> None:  # fmt: skip
     """A network of (V, G) over (inputs, SOC error), see ``learning.run_or_stand``; several of one
     shape may be laid one after another along the first axis of ``w0`` .. ``b2``: their mean
