@@ -89,6 +89,40 @@ def fit_chain(
     )  # fmt: skip
 
 
+def running_kg(
+    cell: Cell, fuel_kg: FloatArray, engine_max_w: float, ocv_v: float, limit_w: float,
+    demand_w: FloatArray, price_kg: float,
+) -> FloatArray:  # fmt: skip
+    """Least fuel and price of battery energy of a running engine at every demand [kg]: taken off
+    the values, so that they stay small."""
+    found = np.empty(len(demand_w))
+    _running(cell, fuel_kg, engine_max_w, ocv_v, limit_w, demand_w, price_kg, found)
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def _running(
+    cell: Cell, fuel_kg: FloatArray, engine_max_w: float, ocv_v: float, limit_w: float,
+    demand_w: FloatArray, price_kg: float, found: FloatArray,
+) -> None:  # fmt: skip
+    for i in range(len(demand_w)):
+        d = demand_w[i]
+        least, most = _range_w(engine_max_w, limit_w, d)
+        low_w, high_w = d - most, d - least
+        y0 = -price_kg * soc_change(cell, ocv_v, low_w)
+        y1 = -price_kg * soc_change(cell, ocv_v, 0.5 * (low_w + high_w))
+        y2 = -price_kg * soc_change(cell, ocv_v, high_w)
+        c0, c1, c2 = parabola(low_w, high_w, cell.unit_w, y0, y1, y2)
+        _, found[i] = best_power_w(fuel_kg, engine_max_w, d, least, most, cell.unit_w, c0, c1, c2)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _range_w(engine_max_w: float, limit_w: float, d: float) -> tuple[float, float]:
+    """Least and most bus power of a running engine that ramps at once [W]."""
+    most = max(min(engine_max_w, d + limit_w), HOLD_ON_W)
+    return min(max(d - BESIDE_SHARE * limit_w, HOLD_ON_W), most), most
+
+
 @njit(cache=True, error_model="numpy")
 def solve_chain(
     cell: Cell, fuel_kg: FloatArray, engine_max_w: float, ocv_v: FloatArray, limit_w: float,
@@ -111,10 +145,7 @@ def solve_chain(
         search = sweep % SEARCH_EVERY == 0
         for z in range(zs):
             d = demand_w[z]
-            least = max(d - limit_w, d - BESIDE_SHARE * limit_w, HOLD_ON_W)
-            most = min(engine_max_w, d + limit_w)
-            most = max(most, HOLD_ON_W)
-            least = min(least, most)
+            least, most = _range_w(engine_max_w, limit_w, d)
             forced = d > BATTERY_SHARE * limit_w
             for s in range(socs):
                 v, held = ocv_v[s], holding_kg[s] - baseline_kg[z]

@@ -1,16 +1,20 @@
 """Policies out of files, of every kind, for whoever drives or scores them."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tractor_ems.policies import q_policy
+from tractor_ems.policies import q_policy, sdp_file
 from tractor_ems.policies.mlp import Float32Array
 from tractor_ems.policies.policy_file import read_policy
 from tractor_ems.policies.protocol import MadePolicy
 from tractor_msgs_py.errors import PolicyError
 from tractor_sim.powertrain_json import powertrain_hash
 
-MAKERS = dict.fromkeys(q_policy.KINDS, q_policy.policy_from)
+MAKERS: dict[str, Callable[[dict[str, Float32Array], dict[str, Any]], MadePolicy]] = {
+    **dict.fromkeys(q_policy.KINDS, q_policy.policy_from),
+    sdp_file.KIND: sdp_file.sdp_from,
+}
 """Kind of policy to what makes one of tensors and metadata."""
 
 
