@@ -1,0 +1,73 @@
+"""Every policy of the held-out study by name: rules, tables and learned ones, the optimum."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+from tractor_ems.policies.made import load_made
+from tractor_ems.policies.protocol import Policy
+from tractor_ems.policies.registry import make_rule
+from tractor_ems.study.pieces import code_digest, digest_of_file
+from tractor_sim.powertrain import PowertrainParams
+from tractor_sim.resources import resource_path
+
+DP = "dp"
+"""The optimum's own plan, which knows the cycle: no opponent, a check of everything else."""
+
+_CODE = (
+    "tractor_ems/drive.py",
+    "tractor_ems/safety.py",
+    "tractor_ems/policies",
+    "tractor_sim",
+    "tractor_msgs_py/observation.py",
+)
+
+
+@dataclass(frozen=True)
+class Driver:
+    """Who drives: a rule by name, or a policy file.
+
+    Attributes:
+        name: what tables call it; seed: of its training.
+        file: policy file, None for a rule; file_sha256: its content.
+    """
+
+    name: str
+    seed: int | None = None
+    file: Path | None = None
+    file_sha256: str = ""
+
+    @property
+    def label(self) -> str:
+        """A name for its files."""
+        return self.name if self.seed is None else f"{self.name}_s{self.seed}"
+
+    @property
+    def identity(self) -> list[Any]:
+        """What decides its decisions, the settings of tuned rules included."""
+        return [self.name, self.seed, self.file_sha256, code_digest(*_CODE), _tuned()]
+
+
+def _tuned() -> list[str]:
+    folder = resource_path("config", "powertrain").parent / "baseline"
+    return [digest_of_file(path) for path in sorted(folder.glob("*.yaml"))]
+
+
+def made_policy(driver: Driver, params: PowertrainParams, *, refit: bool = False) -> Policy:
+    """The policy object.
+
+    Args:
+        params: the powertrain that it believes to drive.
+        refit: a learned policy that was made for another powertrain is given ``params`` as its
+            plant: limits and fuel are then right, what it learnt stays.
+
+    Raises:
+        PolicyError: unknown rule, or an unreadable file.
+        ConfigError: the settings of a tuned rule cannot be read.
+    """
+    if driver.file is None:
+        return make_rule(driver.name, params)
+    policy = load_made(driver.file)
+    if refit:
+        return cast(Policy, replace(cast(Any, policy), params=params))
+    return policy
