@@ -25,8 +25,8 @@ def evaluate(
         list[str] | None,
         typer.Option(
             help="conventional, rule_based, best_point, myopic_greedy, load_levelling, "
-            "never_stop_ecms, dp, default, or a file; several times or with commas. "
-            "Default: default."
+            "never_stop_ecms, ecms, a_ecms, a_ecms_unplanned, dp, default, or a file; several "
+            "times or with commas. Default: default."
         ),
     ] = None,
     powertrain: Powertrain = "paper",

@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from tractor_ems.policies.ecms import NeverStopEcms
-from tractor_ems.policies.levelling import LoadLevelling
+from tractor_ems.policies.baselines import BASELINES, make_baseline
 from tractor_ems.policies.protocol import Policy
 from tractor_ems.policies.rules import BestPoint, Conventional, MyopicGreedy, RuleBased
 from tractor_ems.policies.shipped import shipped_policy
@@ -17,10 +16,9 @@ RULES = (
     "rule_based",
     "best_point",
     "myopic_greedy",
-    "load_levelling",
-    "never_stop_ecms",
+    *BASELINES,
 )
-"""Policies that need neither training nor the future."""
+"""Policies that need neither training nor the future; ``a_ecms`` uses a planned end."""
 
 NAMES = (*RULES, "dp", "default")
 
@@ -41,11 +39,15 @@ def policy_file(name: str, powertrain: str) -> Path:
 
 
 def make_rule(name: str, params: PowertrainParams) -> Policy:
-    """One of :data:`RULES` with its documented defaults.
+    """One of :data:`RULES`; those of ``baselines`` as tuned for the powertrain, the others with
+    their documented defaults.
 
     Raises:
         PolicyError: no such rule.
+        ConfigError: a damaged file of tuned settings.
     """
+    if name in BASELINES:
+        return make_baseline(name, params)
     match name:
         case "conventional":
             return Conventional()
@@ -55,10 +57,6 @@ def make_rule(name: str, params: PowertrainParams) -> Policy:
             return BestPoint(params)
         case "myopic_greedy":
             return MyopicGreedy(params)
-        case "load_levelling":
-            return LoadLevelling(params)
-        case "never_stop_ecms":
-            return NeverStopEcms(params)
     raise PolicyError(f"policy {name!r}: no rule, rules are {', '.join(RULES)}")
 
 
