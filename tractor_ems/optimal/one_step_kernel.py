@@ -9,18 +9,23 @@ from typing import NamedTuple
 
 from numba import njit
 
+from tractor_ems.policies.genset import HOLD_ON_W
+from tractor_ems.policies.one_step import (
+    ALONE_SHARE,
+    BESIDE_SHARE,
+    COARSE,
+    FINE,
+    HEAVY_SHARE,
+    HOLD_S,
+    LEVELS,
+    PEAK_FADE_S,
+    RESTART_SHARE,
+)
 from tractor_msgs_py.trajectory import FloatArray
 from tractor_sim.batch_kernel import Bounds
 
-COARSE, FINE, LEVELS = 25, 9, 3
-"""Engine powers tried over the whole range, then around the best, and how often again."""
-
-HOLD_ON_W = 1.0
-"""Bus power that keeps a started engine on [W]."""
-
-BATTERY_SHARE, BESIDE_SHARE = 0.8, 0.6
-"""Shares of the discharge limit that the battery is planned to carry alone and beside a running
-engine; see ``policies.reserve``."""
+FADE = math.exp(-1.0 / PEAK_FADE_S)
+"""Of a remembered peak per step of 1 s."""
 
 
 class Cell(NamedTuple):
@@ -85,23 +90,28 @@ def best_power_w(
     return best_w, best
 
 
-HOLD_STEPS = 45
-"""How long a running engine is kept after demand that the battery should not carry alone: a start
-is worth 60 s of idling, so waiting about as long as a start costs is never far from the best."""
+class Held(NamedTuple):
+    """The reserve's memory, as ``policies.one_step.Held``; ``since_s`` counts steps of 1 s."""
+
+    peak_w: float
+    since_s: float
+
+
+NOT_HELD = Held(-1.0, 1e9)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def may_stand(
-    b: Bounds, demand_w: float, on: bool, peak_w: float, step_w: float, since: int
-) -> bool:
-    """Whether the engine may be off and the battery is planned to carry the load alone.
-
-    A running engine is held while recent peaks are beyond what the battery and the first second
-    of a restart (``step_w``) give together, and for :data:`HOLD_STEPS` after the last step that
-    needed it (``since`` steps ago).
-    """
-    alone = b.may_be_off and demand_w <= BATTERY_SHARE * b.discharge_w
-    return alone and not (on and (peak_w > b.discharge_w + step_w or since < HOLD_STEPS))
+def hold(b: Bounds, ramp_w: float, demand_w: float, on: bool, held: Held) -> tuple[bool, Held]:
+    """Whether the engine is to run whatever it costs, and the next memory; see
+    ``policies.one_step.hold``. ``ramp_w``: what a restart gives after one step."""
+    peak_w = held.peak_w * FADE if held.peak_w >= 0.0 else b.discharge_w + RESTART_SHARE * ramp_w
+    peak_w = max(demand_w, peak_w)
+    safe = demand_w <= HEAVY_SHARE * b.discharge_w
+    since_s = held.since_s + 1.0 if safe else 0.0
+    heavy = peak_w > ALONE_SHARE * b.discharge_w
+    beyond = not safe if heavy else demand_w > ALONE_SHARE * b.discharge_w
+    kept = on and heavy and since_s < HOLD_S
+    return beyond or kept, Held(peak_w, since_s)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)

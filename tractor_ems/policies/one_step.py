@@ -2,7 +2,7 @@
 
 For policies that differ only in that last part: ECMS (a price), SDP (a table), a learned value
 (a network). Every engine power within the present limits is open to them, ramp limit and minimum
-times included, except what would lean on the battery alone; see ``reserve``.
+times included, except what would lean on the battery alone; see :func:`hold`.
 """
 
 import math
@@ -18,7 +18,7 @@ from tractor_ems.policies.genset import (
     running_fuel_kg_per_s,
 )
 from tractor_ems.policies.q_policy import knot_parabola, knot_powers_w, own_limits
-from tractor_ems.policies.reserve import BATTERY_SHARE, BESIDE_ENGINE_SHARE, starts_slowly
+from tractor_ems.policies.reserve import starts_slowly
 from tractor_msgs_py.observation import Observation
 from tractor_msgs_py.trajectory import BoolArray, FloatArray
 from tractor_sim.powertrain import Command, PowertrainParams
@@ -26,21 +26,32 @@ from tractor_sim.powertrain import Command, PowertrainParams
 COARSE, FINE, LEVELS = 25, 9, 3
 """Engine powers tried over the whole range, then around the best, and how often again: to 1 kW."""
 
-PEAK_FADE_S = 250.0
-"""How fast a peak is forgotten: 250 kW is what battery and restart give together after 50 s; a
-headland turn is shorter."""
+ALONE_SHARE = 0.95
+"""Share of its discharge limit that the battery is planned to carry alone in light work."""
+
+HEAVY_SHARE = 0.6
+"""The same in heavy work, whose demand rises by up to 0.3 of rated power in a second: from there
+the battery and the first second of a restart still meet it."""
+
+BESIDE_SHARE = 0.5
+"""Share planned beside a running engine: the rest is for a rise faster than the engine's ramp."""
+
+PEAK_FADE_S = 1500.0
+"""How slowly the peak is forgotten by which work is told light or heavy [s]."""
+
+HOLD_S = 60.0
+"""How long an engine is kept in heavy work after demand that only it makes safe [s]: longer than
+a headland turn of 31-40 s with its ramps, and about what a start costs in idling. (45 s stopped
+it just before the next pass, and for the 5 s that it must then stand demand was not met.)"""
 
 RESTART_SHARE = 0.9
 """Share of one step's ramp that a restart is counted on for."""
 
-HOLD_S = 45.0
-"""How long a running engine is kept after demand that the battery should not carry alone: a start
-is worth 60 s of idling, so waiting about as long as a start costs is never far from the best."""
-
 
 @dataclass(frozen=True)
 class Held:
-    """What holding an engine remembers, (B,): faded peak demand [W], time since it was needed."""
+    """What the reserve remembers, (B,): faded peak demand, < 0 before the first [W]; time since
+    demand was more than :data:`HEAVY_SHARE` of what the battery can give [s]."""
 
     peak_w: FloatArray
     since_s: FloatArray
@@ -48,22 +59,34 @@ class Held:
 
 def not_held(batch: int) -> Held:
     """Nothing seen yet."""
-    return Held(np.zeros(batch), np.full(batch, 1e9))
+    return Held(np.full(batch, -1.0), np.full(batch, 1e9))
 
 
 def hold(
     params: PowertrainParams, observation: Observation, state: Held
 ) -> tuple[BoolArray, Held]:
-    """Whether a running engine is to be kept, (B,), and the next memory; see :data:`HOLD_S` and
-    :data:`PEAK_FADE_S`. Nothing is held where an engine is back at once."""
+    """Whether the engine is to run whatever it costs, (B,), and the next memory.
+
+    Where an engine is not back at once, demand beyond the battery is met by running it early
+    (:data:`ALONE_SHARE`). Work whose recent peak is beyond the battery is heavy: there the engine
+    runs from :data:`HEAVY_SHARE` on and is kept for :data:`HOLD_S`. Work begins as heavy and is
+    light after ten minutes without such a peak.
+    """
     demand_w, limits = observation.power_demand_w, own_limits(params, observation)
-    peak_w = np.maximum(demand_w, state.peak_w * math.exp(-params.dt_s / PEAK_FADE_S))
-    needed = demand_w > BATTERY_SHARE * limits.discharge_w
-    since_s = np.where(needed, 0.0, state.since_s + params.dt_s)
+    if not starts_slowly(params):
+        return np.zeros(demand_w.shape, dtype=bool), state
     ramp_w = min(params.engine.ramp_w_per_s * params.dt_s, params.engine.power_max_w)
-    beyond = peak_w > limits.discharge_w + RESTART_SHARE * ramp_w
-    kept = observation.engine_on & (beyond | (since_s < HOLD_S)) & starts_slowly(params)
-    return kept, Held(peak_w, since_s)
+    expected_w = limits.discharge_w + RESTART_SHARE * ramp_w
+    faded_w = np.where(
+        state.peak_w < 0.0, expected_w, state.peak_w * math.exp(-params.dt_s / PEAK_FADE_S)
+    )
+    peak_w = np.maximum(demand_w, faded_w)
+    safe = demand_w <= HEAVY_SHARE * limits.discharge_w
+    since_s = np.where(safe, state.since_s + params.dt_s, 0.0)
+    heavy = peak_w > ALONE_SHARE * limits.discharge_w
+    beyond = np.where(heavy, ~safe, demand_w > ALONE_SHARE * limits.discharge_w)
+    kept = observation.engine_on & heavy & (since_s < HOLD_S)
+    return beyond | kept, Held(peak_w, since_s)
 
 
 Continuation = Callable[[FloatArray], FloatArray]
@@ -80,9 +103,8 @@ def running_range_w(
     least_w = np.maximum(least_w, HOLD_ON_W)
     may_be_off = limits.may_be_off & (demand_w <= limits.discharge_w)
     if starts_slowly(params):
-        support_w = demand_w - BESIDE_ENGINE_SHARE * limits.discharge_w
+        support_w = demand_w - BESIDE_SHARE * limits.discharge_w
         least_w = np.maximum(least_w, np.minimum(support_w, most_w))
-        may_be_off &= demand_w <= BATTERY_SHARE * limits.discharge_w
     return np.minimum(least_w, most_w), most_w, limits.engine_w > 0.0, may_be_off
 
 

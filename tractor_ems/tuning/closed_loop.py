@@ -13,41 +13,36 @@ import numpy as np
 from numba import njit
 
 from tractor_ems.optimal.one_step_kernel import (
-    BATTERY_SHARE,
-    HOLD_ON_W,
+    NOT_HELD,
     Cell,
+    Held,
     best_power_w,
     engine_range_w,
-    may_stand,
+    hold,
     parabola,
     soc_change,
 )
+from tractor_ems.policies.genset import HOLD_ON_W
 from tractor_msgs_py.trajectory import FloatArray, IntArray
 from tractor_sim.batch_kernel import Bounds, Plant, Segments, advance, bounds_of, fuel_of
 
 FUEL, STARTS, SHORTFALL, SOC_FINAL, ON_STEPS, LOSS_J, SOC_LOW, SOC_HIGH, ENGINE_J = range(9)
 """Columns of the totals of a run."""
 
-FADE = math.exp(-1.0 / 250.0)
-"""Of a remembered peak per step: 250 kW is 205 kW, which battery and restart give together, after
-50 s; a headland turn is shorter."""
-
-RESTART_SHARE = 0.9
-"""Share of one step's ramp that a restart is counted on for."""
-
 BEND_MOST = 1.0
 """Most that SOC feedback raises or lowers a price of battery energy, relative to it."""
 
 
 class Run(NamedTuple):
-    """What a run carries from step to step: the plant, and what holding an engine remembers."""
+    """What a run carries from step to step: the plant, whether its engine is to run in this step,
+    and what the reserve remembers."""
 
     soc: float
     on: bool
     time_s: float
     engine_w: float
-    peak_w: float
-    since: int
+    must: bool
+    held: Held
 
 
 @njit(cache=True, error_model="numpy")
@@ -215,7 +210,7 @@ def _table(
 def _begin(soc0: float, totals: FloatArray) -> Run:
     totals[:] = 0.0
     totals[SOC_LOW] = totals[SOC_HIGH] = totals[SOC_FINAL] = soc0
-    return Run(soc0, False, 1e3, 0.0, 0.0, 1_000_000)
+    return Run(soc0, False, 1e3, 0.0, False, NOT_HELD)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -224,9 +219,8 @@ def _look(
 ) -> tuple[Run, Bounds]:
     """What is possible in this step, and what demand ``d`` adds to the memory."""
     b = bounds_of(plant, knots, segments, run.soc, run.on, run.time_s, run.engine_w)
-    since = 0 if d > BATTERY_SHARE * b.discharge_w else run.since + 1
-    peak_w = max(d, run.peak_w * FADE)
-    return Run(run.soc, run.on, run.time_s, run.engine_w, peak_w, since), b
+    must, held = hold(b, min(plant.ramp_w, plant.power_max_w), d, run.on, run.held)
+    return Run(run.soc, run.on, run.time_s, run.engine_w, must, held), b
 
 
 @njit(cache=True, error_model="numpy")
@@ -235,9 +229,7 @@ def _finish(
     d: float, wants: bool, run_w: float, totals: FloatArray, trace: FloatArray,
 ) -> Run:  # fmt: skip
     """Run at ``run_w`` or stand: as wanted, where the engine may stand and may run at all."""
-    step_w = RESTART_SHARE * plant.ramp_w
-    runs = wants or not may_stand(b, d, run.on, run.peak_w, step_w, run.since)
-    runs = runs and b.engine_w > 0.0
+    runs = (wants or run.must or not b.may_be_off) and b.engine_w > 0.0
     command_w, off_w = (d - run_w, np.nan) if runs else (d, 0.0)
     r = advance(plant, b, run.soc, run.on, run.time_s, d, command_w, off_w)
     totals[FUEL] += fuel_of(plant, knots, segments, r.engine_power_w, r.engine_on, r.started)
@@ -252,4 +244,4 @@ def _finish(
     totals[SOC_HIGH] = max(totals[SOC_HIGH], r.soc)
     if len(trace):
         trace[t, 0], trace[t, 1], trace[t, 2] = r.soc, r.engine_power_w, r.engine_on
-    return Run(r.soc, r.engine_on, r.time_in_state_s, r.engine_power_w, run.peak_w, run.since)
+    return Run(r.soc, r.engine_on, r.time_in_state_s, r.engine_power_w, run.must, run.held)
