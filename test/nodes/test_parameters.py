@@ -64,6 +64,11 @@ def run(domain_id, monkeypatch, capfd):
         ("dp_policy", "cycle:=planter_0x", "cycle 'planter_0x': unknown"),
         ("ddqn_policy", "policy_file:=none.safetensors", "none.safetensors"),
         ("ddqn_policy", "policy:=none.safetensors", "parameter policy: unknown"),
+        ("ddqn_policy", "powertrain:=wheel_loader", "none ships for powertrain 'wheel_loader'"),
+        ("ddqn_policy", "signals:=signals", "a vehicle does not say which"),
+        ("ddqn_policy", "outside_envelope:=stop", "one of warn, fallback"),
+        ("rule_based_policy", "planned_work_s:=-1.0", "range 0..1e+07"),
+        ("dp_policy", "planned_work_s:=60.0", "parameter planned_work_s: unknown"),
     ],
 )
 def test_a_bad_parameter_stops_the_node_with_one_line_and_code_2(run, name, override, said):

@@ -20,7 +20,7 @@ from tractor_ems.decide import DecideConfig
 from tractor_ems.handover import HandoverConfig, Mode
 from tractor_ems.nodes import rule_based_policy
 from tractor_ems.nodes.policy_node import PolicyNode
-from tractor_ems.nodes.policy_parameters import COMMON, SOC_TARGET
+from tractor_ems.nodes.policy_parameters import COMMON, OUTSIDE, PLANNED_WORK, SOC_TARGET
 from tractor_ems.nodes.policy_setup import Paperwork
 from tractor_ems.nodes.policy_topics import SHADOW, CommandOutlet
 from tractor_ems.nodes.vehicle_node import VehicleNode
@@ -258,7 +258,7 @@ def test_a_signal_that_stops_ends_trust_although_others_go_on(graph, drive, vehi
 
 def test_dynamic_parameters_are_checked_committed_and_the_others_refused(graph, drive, vehicle):
     node = drive(BUS, Half())
-    ros, parameters = node._node, (*COMMON, SOC_TARGET)
+    ros, parameters = node._node, (*COMMON, *OUTSIDE, SOC_TARGET, PLANNED_WORK)
     declare(ros, parameters)
     accept_changes(ros, parameters, node)
     until(graph, vehicle, lambda: node._answerer.run, "a run")
@@ -278,6 +278,16 @@ def test_dynamic_parameters_are_checked_committed_and_the_others_refused(graph, 
         refused = put(name, value)
         assert not refused.successful and refused.reason
     assert "read-only" in put("signals", "other").reason
+    assert put("planned_work_s", 1800.0).successful
+    assert put("outside_envelope", "fallback").successful
+    assert put("outside_envelope_s", 3.0).successful
+    config = answerer.decider.config
+    assert (config.outside_fallback, config.outside_s) == (True, 3.0)
+    until(graph, vehicle, lambda: "time_left_s" in node._values(), "the countdown")
+    assert 1700.0 < node._values()["time_left_s"] <= 1800.0
+    for name, value in (("planned_work_s", -1.0), ("outside_envelope", "stop")):
+        refused = put(name, value)
+        assert not refused.successful and refused.reason
     assert answerer.run.soc_target == 0.8
 
 
@@ -380,7 +390,8 @@ def test_a_shadow_takes_over_from_a_real_incumbent_and_its_log_survives_sigkill(
     vehicle = {"powertrain": "paper:dt_s=0.1"}
     peer = graph.peer(topics.POWERTRAIN)
     client = peer.node.create_client(SetBool, "ddqn_policy/enable")
-    shadow = start("ddqn_policy", signals="signals", shadow=True, shadow_log=str(log), **LOOSE)
+    words = {"signals": "signals", "powertrain": "paper", "shadow": True, "shadow_log": str(log)}
+    shadow = start("ddqn_policy", **words, **LOOSE)
     incumbent = start("rule_based_policy", policy="conventional", **vehicle)
     plant = start("plant_sim", cycle=str(path), mode="real_time", **vehicle)
 
