@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
@@ -22,10 +22,12 @@ Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Discount = Annotated[float, Field(ge=0.0, lt=1.0)]
 Rate = Annotated[float, Field(gt=0.0, le=1.0)]
 Seconds = Annotated[float, Field(gt=0.0, le=86_400.0)]
-Widths = Annotated[
-    tuple[Annotated[int, Field(ge=1, le=4096)], ...], Field(min_length=1, max_length=15)
-]
+Positive = Annotated[float, Field(gt=0.0, le=1e6)]
+NotNegative = Annotated[float, Field(ge=0.0, le=1e6)]
+Width = Annotated[int, Field(ge=1, le=4096)]
+Widths = Annotated[tuple[Width, ...], Field(min_length=1, max_length=15)]
 ActivationName = Literal["relu", "tanh"]
+Targets = Literal["counterfactual", "sampled", "run_or_stand"]
 LossName = Literal["huber", "mse"]
 
 
@@ -106,26 +108,112 @@ class SampledConfig:
 
 
 @dataclass(frozen=True, config=_STRICT)
+class Augmentation:
+    """Demand made from the recorded one, so that work is also seen that was not recorded.
+
+    Attributes:
+        scaled: series, per 100 recorded ones, whose power is scaled by a factor in
+            ``scale_range``.
+        squeezed: series, per 100 recorded ones, whose time is squeezed to a share in
+            ``squeeze_range`` as well, repeated to their old length, and whose power is scaled by
+            one in ``squeeze_scale_range``: shorter strokes.
+    """
+
+    scaled: Annotated[int, Field(ge=0, le=10_000)] = 40
+    scale_range: tuple[Positive, Positive] = (0.4, 1.25)
+    squeezed: Annotated[int, Field(ge=0, le=10_000)] = 60
+    squeeze_range: tuple[Positive, Positive] = (0.2, 0.7)
+    squeeze_scale_range: tuple[Positive, Positive] = (0.35, 0.9)
+
+
+@dataclass(frozen=True, config=_STRICT)
+class RunOrStandConfig:
+    """Double Q-learning of letting the engine run or stand, for engines that start slowly.
+
+    Attributes:
+        planned: the policy knows when the work is planned to end and pays for SOC then; else it
+            pays for being off its target all the time.
+        updates, batch: gradient steps; ticks per step, each at ``errors`` SOC errors.
+        learning_rate, hold_fraction, final_fraction: as in ``CounterfactualConfig``.
+        target_rate: share of the online net that the averaged one takes over per update.
+        gamma: discount per second.
+        commit_s: how long a choice lasts in the targets.
+        horizon_s: farthest time left that is learned; near_end: share of the samples drawn from
+            the last ``near_end_s``.
+        end_kg: cost of a SOC error at the planned end, per SOC^2.
+        holding_kg_per_s, wall_kg_per_s, wall_at, most_kg_per_s: cost of a SOC error e per second,
+            min(holding e^2 + wall (e / wall_at)^16, most).
+        price: of a unit of SOC, times the marginal fuel of a running engine.
+        soc_scale: of the SOC error as an input; soc_width: half width of the errors drawn, less
+            where ``soc_per_s`` would not lead back in time.
+        gain_weight, level_weight: weights of G's squared error and of V's mean error per tick,
+            against V's error about that mean.
+        short_kg_per_j: price of demand left unmet.
+        double: choose with the online net, evaluate with the averaged one.
+        hidden: of the network, tanh.
+        low_pass_s, mean_prior_s: demand filters that the policy sees.
+        augmentation: demand made from the recorded one.
+    """
+
+    planned: bool = True
+    updates: Count = 10_000
+    batch: Count = 128
+    errors: Annotated[int, Field(ge=2, le=64)] = 4
+    learning_rate: Rate = 2e-3
+    hold_fraction: Fraction = 0.4
+    final_fraction: Fraction = 0.01
+    target_rate: Rate = 0.04
+    gamma: Annotated[float, Field(ge=0.0, le=1.0)] = 1.0
+    commit_s: Seconds = 12.0
+    horizon_s: Seconds = 2400.0
+    near_end: Fraction = 0.25
+    near_end_s: Seconds = 400.0
+    end_kg: Annotated[float, Field(ge=0.0, le=1e6)] = 30.0
+    holding_kg_per_s: NotNegative = 0.0
+    wall_kg_per_s: NotNegative = 2e-3
+    wall_at: Positive = 0.23
+    most_kg_per_s: NotNegative = 0.02
+    price: Positive = 1.02
+    soc_scale: Positive = 0.1
+    soc_width: Positive = 0.26
+    soc_per_s: Positive = 4e-4
+    gain_weight: NotNegative = 4.0
+    level_weight: NotNegative = 0.0
+    short_kg_per_j: NotNegative = 2e-6
+    double: bool = True
+    hidden: tuple[Width, Width] = (64, 64)
+    low_pass_s: Annotated[tuple[Seconds, ...], Field(max_length=8)] = (8.0, 30.0, 120.0)
+    mean_prior_s: Seconds = 600.0
+    augmentation: Augmentation = Augmentation()
+
+
+Mode: TypeAlias = CounterfactualConfig | SampledConfig | RunOrStandConfig
+
+
+@dataclass(frozen=True, config=_STRICT)
 class TrainConfig:
     """One training run; everything that decides its result besides the bags.
 
     Attributes:
         targets: ``counterfactual`` (the plant is known, demand exogenous: all actions of every
-            recorded step) or ``sampled`` (replayed transitions).
+            recorded step), ``run_or_stand`` (the same for engines that start slowly: every
+            recorded stretch with the engine running and standing) or ``sampled`` (replayed
+            transitions).
         reward: see ``rewards.RewardConfig``.
         powertrain: shipped name or YAML file.
         allow_other_powertrain: use bags recorded on another powertrain; of their demand only, so
-            only with ``counterfactual``.
+            not with ``sampled``.
         allow_held_out: use bags of held-out cycles, which makes any score on those worthless.
         seed: of every generator.
         actions: size of the battery-power grid; 1600 is the paper's.
         interact: simulated episodes to add.
-        mean_prior_s, low_pass_s: demand filters that the policy sees.
-        counterfactual, sampled: settings of the two modes.
+        mean_prior_s, low_pass_s: demand filters that the policy sees; ``run_or_stand`` has its
+            own.
+        counterfactual, sampled, run_or_stand: settings of the modes.
         checkpoint_every: updates between checkpoints; the last one is always kept.
     """
 
-    targets: Literal["counterfactual", "sampled"] = "counterfactual"
+    targets: Targets = "counterfactual"
     reward: RewardConfig = RewardConfig()
     powertrain: str = "paper"
     allow_other_powertrain: bool = False
@@ -137,13 +225,14 @@ class TrainConfig:
     low_pass_s: Seconds = 8.0
     counterfactual: CounterfactualConfig = CounterfactualConfig()
     sampled: SampledConfig = SampledConfig()
+    run_or_stand: RunOrStandConfig = RunOrStandConfig()
     checkpoint_every: Count = 1000
 
     def __post_init__(self) -> None:
         if self.allow_other_powertrain and self.targets == "sampled":
             raise ConfigError(
                 "allow_other_powertrain: true with targets sampled, which would replay what "
-                "another plant did; allowed with targets counterfactual"
+                "another plant did; allowed with targets counterfactual and run_or_stand"
             )
 
     @property
@@ -152,9 +241,14 @@ class TrainConfig:
         return self.mode.updates
 
     @property
-    def mode(self) -> CounterfactualConfig | SampledConfig:
+    def mode(self) -> Mode:
         """Settings of the chosen mode."""
-        return self.counterfactual if self.targets == "counterfactual" else self.sampled
+        modes: dict[Targets, Mode] = {
+            "counterfactual": self.counterfactual,
+            "sampled": self.sampled,
+            "run_or_stand": self.run_or_stand,
+        }
+        return modes[self.targets]
 
     def to_json(self) -> dict[str, Any]:
         """Plain data, for policy files and checkpoints."""
@@ -171,7 +265,7 @@ def step_target_rate(config: CounterfactualConfig, dt_s: float) -> float:
     return min(config.target_rate / dt_s, 1.0)
 
 
-def learning_rate(mode: CounterfactualConfig | SampledConfig, step: int) -> float:
+def learning_rate(mode: Mode, step: int) -> float:
     """Learning rate of update number ``step`` (from 0): held, then a cosine down."""
     begin = mode.hold_fraction * mode.updates
     if step <= begin:

@@ -91,12 +91,12 @@ def make_problem(
     if np.isfinite(engine.ramp_w_per_s) or engine.min_on_s > 0 or engine.min_off_s > 0:
         raise ConfigError(
             f"targets counterfactual: powertrain {params.name} has a ramp limit or minimum on/off "
-            "times, which need targets sampled"
+            "times: use preset field (targets run_or_stand)"
         )
     if not params.battery.lossless:
         raise ConfigError(
-            f"targets counterfactual: powertrain {params.name} has a battery with losses, which "
-            "needs targets sampled"
+            f"targets counterfactual: powertrain {params.name} has a battery with losses, for "
+            "which there is preset field (targets run_or_stand)"
         )
     demand_w = samples.power_demand_w
     table = build_cost_table(reward, params, actions, float(demand_w.min()), float(demand_w.max()))

@@ -1,12 +1,19 @@
 """What a training run is made of: inputs, reward, networks, replay; and the policy it makes."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tractor_ems.learning.config import SampledConfig, TrainConfig, step_discount
+from tractor_ems.learning.augment import augmented
+from tractor_ems.learning.config import (
+    RunOrStandConfig,
+    SampledConfig,
+    TrainConfig,
+    step_discount,
+)
 from tractor_ems.learning.dqn import SampledLearner
 from tractor_ems.learning.interact import episode, episode_cycles, training_demand_w
 from tractor_ems.learning.recorded import Drive, drive_of_trace, replay_transitions
@@ -26,8 +33,11 @@ from tractor_ems.learning.samples import (
     observation_spec,
     servable_demand_w,
 )
+from tractor_ems.policies.envelope import envelope_of
 from tractor_ems.policies.mlp import Mlp
-from tractor_ems.policies.q_policy import Normalisation, QPolicy
+from tractor_ems.policies.q_policy import Normalisation, QPolicy, save_policy
+from tractor_ems.policies.run_or_stand import RunOrStand
+from tractor_ems.policies.run_or_stand_file import save_run_or_stand
 from tractor_ems.signals.vehicle import sampled_spec
 from tractor_msgs_py.errors import ConfigError
 from tractor_msgs_py.observation import ObservationSpec
@@ -58,7 +68,9 @@ class Experiment:
     scaling: Normalisation
 
     def policy(self, net: Mlp, metadata: dict[str, Any] | None = None) -> QPolicy:
-        """The policy of a network."""
+        """The policy of a network of one of the two modes that choose among battery powers."""
+        mode = self.config.mode
+        assert not isinstance(mode, RunOrStandConfig)
         return QPolicy(
             name="ddqn_counterfactual"
             if self.config.targets == "counterfactual"
@@ -68,7 +80,7 @@ class Experiment:
             reward=self.reward,
             net=net,
             scaling=self.scaling,
-            gamma=step_discount(self.config.mode, self.params.dt_s),
+            gamma=step_discount(mode, self.params.dt_s),
             actions=self.config.actions,
             metadata=metadata or {},
         )
@@ -83,11 +95,12 @@ class Generators:
     seeding: np.random.Generator
     episodes: np.random.Generator
     explore: np.random.Generator
+    augment: np.random.Generator
 
 
 def make_generators(seed: int) -> Generators:
     """Independent PCG64 streams."""
-    children = np.random.SeedSequence(seed).spawn(5)
+    children = np.random.SeedSequence(seed).spawn(6)
     return Generators(*(np.random.Generator(np.random.PCG64(child)) for child in children))
 
 
@@ -109,7 +122,12 @@ def prepare(
     recorded = distinct_demands(recordings.traces)
     demands = [servable_demand_w(params, demand_w) for demand_w in (*recorded, *simulated)]
     scaling = demand_scaling(demands)
-    spec = observation_spec(scaling, params.dt_s, config.mean_prior_s, config.low_pass_s)
+    own = config.run_or_stand
+    spec = (
+        observation_spec(scaling, params.dt_s, own.mean_prior_s, *own.low_pass_s)
+        if config.targets == "run_or_stand"
+        else observation_spec(scaling, params.dt_s, config.mean_prior_s, config.low_pass_s)
+    )
     if recordings.signals is not None:  # it will drive a vehicle with such signals
         spec = sampled_spec(recordings.signals, params.dt_s, spec.filters)
     return Experiment(
@@ -147,10 +165,68 @@ class CounterfactualRun:
         self.learner = CounterfactualLearner(
             problem, config.counterfactual, generators.init, generators.sample
         )
+        self.experiment = experiment
         self.summary: dict[str, Any] = {"demand_ticks": len(samples.power_demand_w)}
 
     def before_update(self) -> None:
         """Nothing is driven."""
+
+    def save(self, out: Path, metadata: dict[str, Any]) -> None:
+        """Write the policy."""
+        save_policy(out, self.experiment.policy(self.learner.network(), metadata))
+
+    def state(self) -> dict[str, Any]:
+        """The learner's."""
+        return self.learner.state()
+
+    def restore(self, tensors: dict[str, Any], state: dict[str, Any]) -> None:
+        """The learner's."""
+        self.learner.restore(tensors, state)
+
+
+class RunOrStandRun:
+    """Counterfactual learning of running and standing; simulated episodes add demand only."""
+
+    def __init__(self, experiment: Experiment, generators: Generators) -> None:
+        from tractor_ems.learning.run_or_stand import RunOrStandLearner, make_problem
+
+        config, params = experiment.config.run_or_stand, experiment.params
+        self.experiment = experiment
+        made = augmented(
+            experiment.demands_w, config.augmentation, params.p_aux_w, generators.augment
+        )
+        self.demands_w = [*experiment.demands_w, *(servable_demand_w(params, d) for d in made)]
+        samples = demand_samples(self.demands_w, experiment.spec, experiment.scaling, params.dt_s)
+        problem = make_problem(params, config, self.demands_w, samples.inputs)
+        self.prices = problem.prices
+        self.learner = RunOrStandLearner(problem, config, generators.init, generators.sample)
+        ticks = sum(len(demand_w) for demand_w in experiment.demands_w)
+        self.summary: dict[str, Any] = {
+            "demand_ticks": ticks,
+            "made_ticks": len(samples.power_demand_w) - ticks,
+        }
+
+    def before_update(self) -> None:
+        """Nothing is driven."""
+
+    def save(self, out: Path, metadata: dict[str, Any]) -> None:
+        """Write the policy, with the envelope of what it was trained on."""
+        experiment, config = self.experiment, self.experiment.config.run_or_stand
+        params, spec = experiment.params, experiment.spec
+        width = config.soc_width
+        battery, target = params.battery, params.soc_initial
+        soc = (max(target - width, battery.soc_min), min(target + width, battery.soc_max))
+        envelope = envelope_of(spec, self.demands_w, params.dt_s, soc)
+        policy = RunOrStand(
+            params=params,
+            spec=spec,
+            nets=(self.learner.network(),),
+            scaling=replace(experiment.scaling, soc_scale=config.soc_scale),
+            prices=self.prices,
+            horizon_s=config.horizon_s if config.planned else 0.0,
+            metadata={**metadata, "envelope": envelope},
+        )
+        save_run_or_stand(out, policy)
 
     def state(self) -> dict[str, Any]:
         """The learner's."""
@@ -194,6 +270,10 @@ class SampledRun:
             self.learner.replay.add(to_replay(experiment, driven, config.actions, mode))
             self.done += 1
 
+    def save(self, out: Path, metadata: dict[str, Any]) -> None:
+        """Write the policy."""
+        save_policy(out, self.experiment.policy(self.learner.network(), metadata))
+
     def state(self) -> dict[str, Any]:
         """The learner's, and how far exploration got."""
         explore = self.explore.bit_generator.state
@@ -206,10 +286,14 @@ class SampledRun:
         self.explore.bit_generator.state = state["explore_rng"]
 
 
-def begin(experiment: Experiment, generators: Generators) -> CounterfactualRun | SampledRun:
+def begin(
+    experiment: Experiment, generators: Generators
+) -> CounterfactualRun | RunOrStandRun | SampledRun:
     """The run of the chosen mode, at step 0."""
     if experiment.config.targets == "counterfactual":
         return CounterfactualRun(experiment, generators)
+    if experiment.config.targets == "run_or_stand":
+        return RunOrStandRun(experiment, generators)
     return SampledRun(experiment, generators)
 
 

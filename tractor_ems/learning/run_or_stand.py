@@ -1,285 +1,287 @@
 """Counterfactual double Q-learning of one choice: let the engine run or stand for some seconds.
 
-Demand is exogenous and the plant is known, so a recorded stretch of ``commit`` seconds of demand
-teaches what running and standing cost over it from any SOC. The network has two outputs,
+Demand is exogenous and the plant is known, so a recorded stretch of ``commit`` steps of demand
+teaches what running and standing cost over it from any SOC and, because any tick may be followed
+by any planned end, with any time left. The network has two outputs,
 
-    V(z, SOC error)  cost to come if the engine runs for ``commit`` steps, then as is best
-    G(z, SOC error)  what standing saves against that; > 0: stand
+    V(z, time left, SOC error)  cost to come if the engine runs for ``commit`` steps, then as is
+                                best
+    G(z, time left, SOC error)  what standing saves against that; > 0: stand
 
 so that V_on = min(V, V - G) and V_off = min(V + start, V - G). The power of a running engine is
-the one of least fuel at the price of energy that V's slope over SOC gives.
+the one of least fuel at the price of energy that V's slope over SOC gives. To V belongs a known
+part, ``stiffness_kg`` e^2: what ending e away from the target costs where only the battery's
+losses stand in the way.
 
 Why seconds and not steps: one more second of running costs 0.2 g, less than any network's error,
 and a policy that compared single steps put off each stop for ever.
+
+Only differences of V over SOC decide anything, so V is fitted to its targets up to a constant per
+tick: what the rest of the work burns anyway, which varies far more, never enters the loss.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 
-from tractor_ems.learning.networks import Net, copy_towards
-from tractor_ems.optimal.one_step_kernel import (
-    BATTERY_SHARE,
-    BESIDE_SHARE,
-    HOLD_ON_W,
-    Cell,
-    best_power_w,
-    fuel_at,
-    parabola,
-    soc_change,
+from tractor_ems.learning.config import RunOrStandConfig, learning_rate
+from tractor_ems.learning.networks import (
+    Net,
+    adam_tensors,
+    copy_towards,
+    load_adam,
+    load_net,
+    net_tensors,
+    to_numpy,
 )
-from tractor_ems.policies.mlp import Float32Array
+from tractor_ems.learning.stretches import baseline, stretches
+from tractor_ems.optimal.one_step_kernel import Cell
+from tractor_ems.policies.genset import power_max_w, running_fuel_kg_per_s
+from tractor_ems.policies.mlp import Float32Array, Mlp
+from tractor_ems.policies.run_or_stand import (
+    SLOPE_STEP,
+    Prices,
+    prices_of,
+    stiffness_kg,
+    time_inputs,
+)
+from tractor_msgs_py.errors import ConfigError
 from tractor_msgs_py.trajectory import FloatArray, IntArray
+from tractor_sim.battery import open_circuit_v
+from tractor_sim.powertrain import PowertrainParams
+
+FUEL_KNOTS = 4097
+"""Engine powers of the fuel table: 67 W apart on `field`."""
+
+MOST_STARTS = 3.0
+"""Bound of |G| in starts: beyond it the choice is clear, and its size is of no use."""
 
 
 @dataclass(frozen=True)
-class Settings:
-    """Settings of one training run.
+class Problem:
+    """The plant in the form that the compiled stretches need, and the demand to learn from.
 
     Attributes:
-        updates, batch, rate, hold, last: of Adam; the rate is held for a share of the updates,
-            then lowered along a cosine to ``last`` of it.
-        commit: steps that a choice lasts in the targets.
-        gamma: discount per step; target_rate: of the averaged net.
-        price_kg: of one unit of SOC; start_kg: of a start.
-        holding_kg, wall_kg, wall_at, most_kg: holding SOC costs per step, e = SOC - target,
-            min(holding e^2 + wall (e / wall_at)^8, most).
-        unit_kg: cost that the network sees as 1.
-        soc_scale, soc_width: SOC error as input; half width of the errors drawn.
-        gain_weight: weight of G's squared error.
-        min_off, ramp_w: steps and power per step that a restart takes.
-        short_kg_per_j: price of demand left unmet.
-        double: choose with the online net, evaluate with the averaged one.
+        cell, fuel_kg, engine_max_w, limit_w, ocv_v: battery, fuel per step over bus power, most
+            engine power, most battery power, open-circuit voltage at the target.
+        prices: see ``policies.run_or_stand``.
+        min_off, ramp_w: steps, and power per step, that a restart takes.
+        dt_s: step length.
+        demand_w: N ticks of demand, traces end to end; inputs: (N, 1 + F), as the network sees
+            them; ticks: those after which a whole stretch is left of the same trace.
+        baseline_kg: (N,), least cost of running at each tick: taken off, it keeps V small.
+        commit, horizon: steps of a stretch; farthest time left, 0 without a planned end.
     """
 
-    updates: int = 4000
-    batch: int = 256
-    rate: float = 2e-3
-    hold: float = 0.4
-    last: float = 0.01
-    commit: int = 8
-    gamma: float = 0.998
-    target_rate: float = 0.02
-    price_kg: float = 8.0
-    start_kg: float = 0.015
-    holding_kg: float = 0.008
-    wall_kg: float = 3e-4
-    wall_at: float = 0.07
-    most_kg: float = 6e-4
-    unit_kg: float = 0.010
-    soc_scale: float = 0.05
-    soc_width: float = 0.12
-    gain_weight: float = 4.0
-    hidden: tuple[int, int] = (64, 64)
-    double: bool = True
-    min_off: int = 5
-    ramp_w: float = 56e3
-    short_kg_per_j: float = 2e-6
+    cell: Cell
+    fuel_kg: FloatArray
+    engine_max_w: float
+    limit_w: float
+    ocv_v: float
+    prices: Prices
+    min_off: int
+    ramp_w: float
+    dt_s: float
+    demand_w: FloatArray
+    inputs: Float32Array
+    ticks: IntArray
+    baseline_kg: FloatArray
+    commit: int
+    horizon: int
 
 
-SLOPE_STEP = 0.01
-"""Half the distance over which V's slope over SOC is taken."""
+def make_problem(
+    params: PowertrainParams,
+    config: RunOrStandConfig,
+    demands_w: Sequence[FloatArray],
+    inputs: Float32Array,
+) -> Problem:
+    """The problem of a powertrain and its demand series; ``inputs``: of all of them, end to end.
 
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def held_kg(settings: FloatArray, error: float) -> float:
-    """Holding cost of one step [kg]; ``settings``: quadratic, wall, its place, most."""
-    far = (error / settings[2]) ** 2
-    cost = settings[0] * error * error + settings[1] * far * far * far * far
-    held: float = min(cost, settings[3])
-    return held
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def power_at_price(
-    cell: Cell, fuel_kg: FloatArray, engine_max_w: float, ocv_v: float, demand_w: float,
-    least_w: float, most_w: float, per_soc_kg: float,
-) -> float:  # fmt: skip
-    """Engine power of least fuel less SOC gained at a price [W]."""
-    low_w, high_w = demand_w - most_w, demand_w - least_w
-    y0 = -per_soc_kg * soc_change(cell, ocv_v, low_w)
-    y1 = -per_soc_kg * soc_change(cell, ocv_v, 0.5 * (low_w + high_w))
-    y2 = -per_soc_kg * soc_change(cell, ocv_v, high_w)
-    c0, c1, c2 = parabola(low_w, high_w, cell.unit_w, y0, y1, y2)
-    best_w, _ = best_power_w(
-        fuel_kg, engine_max_w, demand_w, least_w, most_w, cell.unit_w, c0, c1, c2
+    Raises:
+        ConfigError: no trace is longer than a stretch.
+    """
+    battery, engine, dt_s = params.battery, params.engine, params.dt_s
+    commit = max(round(config.commit_s / dt_s), 1)
+    ends = np.cumsum([len(d) for d in demands_w])
+    begins = np.append(0, ends[:-1])
+    ticks = np.concatenate(
+        [np.arange(b, max(e - commit, b)) for b, e in zip(begins, ends, strict=True)]
     )
-    return best_w
+    if not len(ticks):
+        raise ConfigError(f"training: no trace is longer than commit_s, {config.commit_s:g} s")
+    most_w = power_max_w(params)
+    cell = Cell(battery.resistance_ohm, battery.charge_c / dt_s, battery.power_max_w)
+    fuel_kg = running_fuel_kg_per_s(params, np.linspace(0.0, most_w, FUEL_KNOTS)) * dt_s
+    ocv_v = float(open_circuit_v(battery, np.array([params.soc_initial]))[0])
+    prices = prices_of(params, config.price, config.end_kg if config.planned else 0.0)
+    demand_w = np.concatenate(demands_w)
+    return Problem(
+        cell=cell,
+        fuel_kg=fuel_kg,
+        engine_max_w=most_w,
+        limit_w=battery.power_max_w,
+        ocv_v=ocv_v,
+        prices=prices,
+        min_off=round(engine.min_off_s / dt_s),
+        ramp_w=min(engine.ramp_w_per_s * dt_s, most_w),
+        dt_s=dt_s,
+        demand_w=demand_w,
+        inputs=inputs,
+        ticks=ticks,
+        baseline_kg=baseline(
+            cell, fuel_kg, most_w, battery.power_max_w, ocv_v, demand_w, prices.soc_kg
+        ),
+        commit=commit,
+        horizon=round(config.horizon_s / dt_s) if config.planned else 0,
+    )
 
 
-@njit(cache=True, error_model="numpy")
-def stretches(
-    cell: Cell, fuel_kg: FloatArray, engine_max_w: float, limit_w: float, ocv_v: float,
-    demand_w: FloatArray, baseline_kg: FloatArray, tick: IntArray, error: FloatArray,
-    slope_kg: FloatArray, price_kg: float, start_kg: float, gamma: float, commit: int,
-    min_off: int, ramp_w: float, short_kg_per_w: float, holding: FloatArray,
-    cost: FloatArray, end: FloatArray, end_on: FloatArray,
-) -> None:  # fmt: skip
-    """Cost (B, 2) of running and standing from ``tick`` for ``commit`` steps, SOC errors after it,
-    and whether the engine runs then; what stands is started where the battery should not carry
-    the load alone, as fast as the real engine can. inf: it cannot stand at all."""
-    for i in range(len(tick)):
-        per_soc = price_kg - slope_kg[i]
-        for way in range(2):
-            e, on, total, weight = error[i], way == 0, 0.0, 1.0
-            ready_w = engine_max_w  # what the engine can give: less after a restart
-            for k in range(commit):
-                d = demand_w[tick[i] + k]
-                if not on and d > BATTERY_SHARE * limit_w:
-                    if k == 0:
-                        total = np.inf
-                        break
-                    if k >= min_off:
-                        on, total, ready_w = True, total + weight * start_kg, 0.0
-                ready_w = min(ready_w + ramp_w, engine_max_w)
-                # Demand that a late or slow restart leaves unmet.
-                short_w = max(d - limit_w - (ready_w if on else 0.0), 0.0)
-                total += weight * short_w * short_kg_per_w
-                change, burnt = 0.0, 0.0
-                if on:
-                    least = max(d - BESIDE_SHARE * limit_w, HOLD_ON_W)
-                    most = max(min(ready_w, d + limit_w), HOLD_ON_W)
-                    least = min(least, most)
-                    engine_w = power_at_price(
-                        cell, fuel_kg, engine_max_w, ocv_v, d, least, most, per_soc
-                    )
-                    burnt = fuel_at(fuel_kg, engine_max_w, engine_w)
-                    change = soc_change(cell, ocv_v, min(d - engine_w, limit_w))
-                else:
-                    change = soc_change(cell, ocv_v, min(max(d, -limit_w), limit_w))
-                step = burnt - price_kg * change + held_kg(holding, e)
-                total += weight * (step - baseline_kg[tick[i] + k])
-                e += change
-                weight *= gamma
-            cost[i, way], end[i, way], end_on[i, way] = total, e, on
-
-
-class Learner:
+class RunOrStandLearner:
     """Networks, optimiser and generator of one run; :meth:`update` is one gradient step."""
 
     def __init__(
         self,
-        settings: Settings,
-        cell: Cell,
-        fuel_kg: FloatArray,
-        engine_max_w: float,
-        limit_w: float,
-        ocv_v: float,
-        demands_w: Sequence[FloatArray],
-        inputs: Sequence[Float32Array],
-        seed: int,
+        problem: Problem,
+        config: RunOrStandConfig,
+        init_rng: np.random.Generator,
+        sample_rng: np.random.Generator,
     ) -> None:
-        s = self.s = settings
-        self.cell, self.fuel_kg, self.engine_max_w = cell, fuel_kg, engine_max_w
-        self.limit_w, self.ocv_v = limit_w, ocv_v
-        self.demand_w = np.concatenate(demands_w)
-        self.inputs = np.concatenate(inputs).astype(np.float32)
-        ends = np.cumsum([len(d) for d in demands_w])
-        late = np.concatenate([np.arange(e - s.commit - 1, e) for e in ends])
-        self.ticks = np.setdiff1d(np.arange(len(self.demand_w)), late)
-        init, self.rng = (
-            np.random.Generator(np.random.PCG64(child))
-            for child in np.random.SeedSequence(seed).spawn(2)
-        )
-        sizes = (self.inputs.shape[1] + 1, *s.hidden, 2)
-        self.online, self.target = Net(sizes, "tanh", init), Net(sizes, "tanh", init)
+        self.problem, self.config, self.rng = problem, config, sample_rng
+        extra = time_inputs(np.zeros(1), config.horizon_s).shape[1] if config.planned else 0
+        sizes = (problem.inputs.shape[1] + extra + 1, *config.hidden, 2)
+        self.online, self.target = Net(sizes, "tanh", init_rng), Net(sizes, "tanh", init_rng)
         copy_towards(self.target, self.online, 1.0)
-        self.adam = torch.optim.Adam(self.online.parameters(), lr=s.rate, fused=True)
-        self.step, self.level = 0, 0.0
-        self.holding = np.array([s.holding_kg, s.wall_kg, s.wall_at, s.most_kg])
-        self.baseline_kg = baseline(
-            cell, fuel_kg, engine_max_w, limit_w, ocv_v, self.demand_w, s.price_kg
+        self.adam = torch.optim.Adam(self.online.parameters(), lr=config.learning_rate, fused=True)
+        self.step = 0
+        c, dt_s = config, problem.dt_s
+        self.holding = np.array(
+            [c.holding_kg_per_s * dt_s, c.wall_kg_per_s * dt_s, c.wall_at, c.most_kg_per_s * dt_s]
         )
+
+    def rows(self, tick: IntArray, left: IntArray, error: FloatArray) -> Float32Array:
+        """Network inputs of ticks (B,) with steps left (B,) at SOC errors (B, K), (B K, n)."""
+        p, k = self.problem, error.shape[1]
+        known = [p.inputs[tick]]
+        if p.horizon:
+            known.append(time_inputs(p.dt_s * left.astype(np.float64), self.config.horizon_s))
+        column = (error.reshape(-1, 1) / self.config.soc_scale).astype(np.float32)
+        return np.concatenate((np.repeat(np.concatenate(known, 1), k, axis=0), column), axis=1)
 
     @torch.no_grad()
     def values(
-        self, net: Net, inputs: Float32Array, error: FloatArray
+        self, net: Net, tick: IntArray, left: IntArray, error: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """V and G [units] at SOC errors (B, K)."""
-        k = error.shape[1]
-        column = (error.reshape(-1, 1) / self.s.soc_scale).astype(np.float32)
-        rows = np.concatenate((np.repeat(inputs, k, axis=0), column), axis=1)
-        out = net(torch.from_numpy(rows)).double().numpy().reshape(*error.shape, 2)
-        return out[..., 0], out[..., 1]
+        """V and G [units] at SOC errors (B, K), the known part of V included."""
+        rows = torch.from_numpy(self.rows(tick, left, error))
+        out = net(rows).double().numpy().reshape(*error.shape, 2)
+        return out[..., 0] + self.known(left, error), out[..., 1]
 
-    def backup(self, tick: IntArray, error: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Targets of V and G at ``tick`` [units]."""
-        s = self.s
-        near = error[:, None] + np.array([-SLOPE_STEP, SLOPE_STEP])
-        v, g = self.values(self.target, self.inputs[tick], near)
-        on = np.minimum(v, v - g)
-        slope = (on[:, 1] - on[:, 0]) / (2.0 * SLOPE_STEP) * s.unit_kg
-        cost, end, end_on = np.empty((3, len(tick), 2))
+    def known(self, left: IntArray, error: FloatArray) -> FloatArray:
+        """The part of V that is known [units]."""
+        p = self.problem
+        stiff = stiffness_kg(p.prices, p.dt_s * left.astype(np.float64)) / p.prices.unit_kg
+        found: FloatArray = stiff[:, None] * error * error
+        return found
+
+    def backup(
+        self, tick: IntArray, left: IntArray, error: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Targets of V and G at ticks (B,) with steps left (B,) and SOC errors (B, K) [units]."""
+        p, c, prices = self.problem, self.config, self.problem.prices
+        b, k = error.shape
+        near = (error[..., None] + np.array([-SLOPE_STEP, SLOPE_STEP])).reshape(b, 2 * k)
+        v, g = self.values(self.target, tick, left, near)
+        on = np.minimum(v, v - g).reshape(b, k, 2)
+        slope = (on[..., 1] - on[..., 0]) / (2.0 * SLOPE_STEP) * prices.unit_kg
+        steps = np.minimum(left, p.commit) if p.horizon else np.full(b, p.commit)
+        cost, end, end_on = np.empty((3, b * k, 2))
+        gamma = c.gamma**p.dt_s
         stretches(
-            self.cell, self.fuel_kg, self.engine_max_w, self.limit_w, self.ocv_v, self.demand_w,
-            self.baseline_kg, tick, error, slope, s.price_kg, s.start_kg, s.gamma, s.commit,
-            s.min_off, s.ramp_w, s.short_kg_per_j, self.holding, cost, end, end_on,
+            p.cell, p.fuel_kg, p.engine_max_w, p.limit_w, p.ocv_v, p.demand_w, p.baseline_kg,
+            np.repeat(tick, k), np.repeat(steps, k), error.ravel(), slope.ravel(), prices.soc_kg,
+            prices.start_kg, gamma, p.min_off, p.ramp_w, c.short_kg_per_j * p.dt_s, self.holding,
+            cost, end, end_on,
         )  # fmt: skip
-        start = s.start_kg / s.unit_kg
-        after = self.inputs[tick + s.commit]
-        v, g = self.values(self.target, after, end)
-        choice = self.values(self.online, after, end)[1] if s.double else g
-        restart = np.where(end_on > 0, 0.0, start)
+        start = prices.start_kg / prices.unit_kg
+        after, end = tick + steps, end.reshape(b, 2 * k)
+        then_left = left - steps
+        v, g = self.values(self.target, after, then_left, end)
+        choice = self.values(self.online, after, then_left, end)[1] if c.double else g
+        restart = np.where(end_on.reshape(b, 2 * k) > 0, 0.0, start)
         then = np.where(choice > -restart, v - g, v + restart)
-        total = cost / s.unit_kg + s.gamma**s.commit * then
-        most = 3.0 * start
-        return total[:, 0], np.clip(total[:, 0] - total[:, 1], -most, most)
+        if p.horizon:
+            over = (then_left == 0)[:, None]
+            then = np.where(over, self.known(then_left, end), then)
+        then *= (gamma**steps)[:, None]
+        total = (cost.reshape(b, 2 * k) / prices.unit_kg + then).reshape(b, k, 2)
+        most = MOST_STARTS * start
+        return total[..., 0], np.clip(total[..., 0] - total[..., 1], -most, most)
 
-    def update(self) -> float:
-        """One gradient step; returns the loss."""
-        s = self.s
-        tick = self.rng.choice(self.ticks, s.batch)
-        error = self.rng.uniform(-s.soc_width, s.soc_width, s.batch)
-        y_v, y_g = self.backup(tick, error)
-        # Values are kept around 0: a constant in all of them changes no choice.
-        self.level += 0.05 * (float(y_v.mean()) - self.level)
-        column = (error / s.soc_scale).astype(np.float32)[:, None]
-        rows = np.concatenate((self.inputs[tick], column), axis=1)
-        out = self.online(torch.from_numpy(rows))
-        aim = torch.from_numpy(np.stack((y_v - self.level, y_g), axis=1).astype(np.float32))
-        squares = (out - aim) ** 2
-        loss = squares[:, 0].mean() + s.gain_weight * squares[:, 1].mean()
-        done = min(max(0.0, (self.step / s.updates - s.hold) / (1.0 - s.hold)), 1.0)
-        lr = s.rate * (s.last + (1.0 - s.last) * 0.5 * (1.0 + np.cos(np.pi * done)))
-        self.adam.param_groups[0]["lr"] = lr
+    def draw(self) -> tuple[IntArray, IntArray, FloatArray]:
+        """Ticks, steps left, and SOC errors for each; see ``RunOrStandConfig``."""
+        p, c, rng = self.problem, self.config, self.rng
+        b, k = c.batch, c.errors
+        tick = rng.choice(p.ticks, b)
+        if not p.horizon:
+            return tick, np.zeros(b, dtype=np.int64), rng.uniform(-1.0, 1.0, (b, k)) * c.soc_width
+        share = rng.random(b)
+        far = rng.integers(1, p.horizon + 1, b)
+        near = rng.integers(1, max(round(c.near_end_s / p.dt_s), 2), b)
+        left = np.where(share < c.near_end, near, far)
+        # Far from the target with little time left is where no sound drive gets to.
+        width = np.minimum(c.soc_width, 0.05 + c.soc_per_s * left * p.dt_s)
+        return tick, left, rng.uniform(-1.0, 1.0, (b, k)) * width[:, None]
+
+    def update(self) -> dict[str, Any]:
+        """One gradient step; returns its loss."""
+        c = self.config
+        tick, left, error = self.draw()
+        y_v, y_g = self.backup(tick, left, error)
+        y_v -= self.known(left, error)
+        rows = self.rows(tick, left, error)
+        out = self.online(torch.from_numpy(rows)).reshape(*error.shape, 2)
+        miss_v = out[..., 0] - torch.from_numpy(y_v.astype(np.float32))
+        miss_g = out[..., 1] - torch.from_numpy(y_g.astype(np.float32))
+        common = miss_v.mean(dim=1, keepdim=True)
+        loss = ((miss_v - common) ** 2).mean() + c.gain_weight * (miss_g**2).mean()
+        if c.level_weight:
+            loss = loss + c.level_weight * (common**2).mean()
+        self.adam.param_groups[0]["lr"] = learning_rate(c, self.step)
         self.adam.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         self.adam.step()
-        copy_towards(self.target, self.online, s.target_rate)
+        copy_towards(self.target, self.online, c.target_rate)
         self.step += 1
-        return float(loss.detach())
+        return {
+            "losses/td_loss": loss.detach(),
+            "losses/gain_loss": (miss_g.detach() ** 2).mean(),
+            "losses/q_values": -out[..., 0].detach().mean(),
+        }
 
-    def weights(self, *, averaged: bool = True) -> tuple[FloatArray, ...]:
-        """Weights and biases in turn, for ``closed_loop.drive_choice``."""
-        net = self.target if averaged else self.online
-        pairs = zip(net.weights, net.biases, strict=True)
-        return tuple(
-            np.ascontiguousarray(t.detach().numpy().astype(np.float64)) for p in pairs for t in p
-        )
+    def network(self) -> Mlp:
+        """The averaged network, for a policy."""
+        return to_numpy(self.target)
 
+    def tensors(self) -> dict[str, Any]:
+        """Everything of the run that is an array."""
+        return {
+            **net_tensors(self.online, "online"),
+            **net_tensors(self.target, "target"),
+            **adam_tensors(self.adam),
+        }
 
-def baseline(
-    cell: Cell, fuel_kg: FloatArray, engine_max_w: float, limit_w: float, ocv_v: float,
-    demand_w: FloatArray, price_kg: float,
-) -> FloatArray:  # fmt: skip
-    """Least fuel and price of battery energy of a running engine at every demand [kg]."""
-    found = np.empty(len(demand_w))
-    _baseline(cell, fuel_kg, engine_max_w, limit_w, ocv_v, demand_w, price_kg, found)
-    return found
+    def state(self) -> dict[str, Any]:
+        """Everything else: step and generator."""
+        return {"step": self.step, "sample_rng": self.rng.bit_generator.state}
 
-
-@njit(cache=True, error_model="numpy")
-def _baseline(
-    cell: Cell, fuel_kg: FloatArray, engine_max_w: float, limit_w: float, ocv_v: float,
-    demand_w: FloatArray, price_kg: float, found: FloatArray,
-) -> None:  # fmt: skip
-    for i in range(len(demand_w)):
-        d = demand_w[i]
-        most = max(min(engine_max_w, d + limit_w), HOLD_ON_W)
-        least = min(max(d - BESIDE_SHARE * limit_w, HOLD_ON_W), most)
-        engine_w = power_at_price(cell, fuel_kg, engine_max_w, ocv_v, d, least, most, price_kg)
-        change = soc_change(cell, ocv_v, d - engine_w)
-        found[i] = fuel_at(fuel_kg, engine_max_w, engine_w) - price_kg * change
+    def restore(self, tensors: dict[str, Any], state: dict[str, Any]) -> None:
+        """Continue where :meth:`tensors` and :meth:`state` were taken."""
+        load_net(self.online, tensors, "online")
+        load_net(self.target, tensors, "target")
+        load_adam(self.adam, tensors)
+        self.step = int(state["step"])
+        self.rng.bit_generator.state = state["sample_rng"]

@@ -53,15 +53,15 @@ def demand_scaling(demands_w: Sequence[FloatArray]) -> Normalisation:
 
 
 def observation_spec(
-    scaling: Normalisation, dt_s: float, mean_prior_s: float, low_pass_s: float
+    scaling: Normalisation, dt_s: float, mean_prior_s: float, *low_pass_s: float
 ) -> ObservationSpec:
     """What the policy sees of demand: now, its running mean (which starts at the training mean,
-    counted as ``mean_prior_s`` of experience) and a low pass."""
+    counted as ``mean_prior_s`` of experience) and low passes."""
     return ObservationSpec(
         dt_s=dt_s,
         filters=(
             DemandFilter("running_mean", mean_prior_s, scaling.demand_offset_w),
-            DemandFilter("low_pass", low_pass_s),
+            *(DemandFilter("low_pass", time_s) for time_s in low_pass_s),
         ),
     )
 

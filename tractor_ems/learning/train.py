@@ -1,6 +1,6 @@
 """A training run from bags to policy file: the one core behind ``ems train`` and the trainer node.
 
-torch is imported when a counterfactual run begins; sampled ones do without.
+torch is imported when a run on a known plant begins; sampled ones do without.
 """
 
 import signal
@@ -19,7 +19,6 @@ from tractor_ems.learning.checkpoint import checkpoint_path, load_checkpoint, sa
 from tractor_ems.learning.config import TrainConfig, learning_rate
 from tractor_ems.learning.recordings import Recordings, read_recordings
 from tractor_ems.learning.training_log import Report, training_log
-from tractor_ems.policies.q_policy import save_policy
 from tractor_msgs_py import __version__
 from tractor_msgs_py.errors import ConfigError, RunAborted
 from tractor_msgs_py.provenance import command_line as own_command_line
@@ -206,7 +205,7 @@ def train_on(
                     **run.summary,
                 },
             }
-            save_policy(out, experiment.policy(learner.network(), metadata))
+            run.save(out, metadata)
             saved.unlink(missing_ok=True)
     if interrupted and not finished:
         raise KeyboardInterrupt
@@ -244,7 +243,7 @@ def _one_thread(config: TrainConfig) -> AbstractContextManager[None]:
     Raises:
         ConfigError: torch is missing.
     """
-    if config.targets != "counterfactual":
+    if config.targets == "sampled":
         return nullcontext()
     try:
         from tractor_ems.learning.networks import one_thread
@@ -252,7 +251,7 @@ def _one_thread(config: TrainConfig) -> AbstractContextManager[None]:
         if error.name != "torch":
             raise
         raise ConfigError(
-            "targets counterfactual: training needs torch: pip install 'tractor_ems[train]'"
+            f"targets {config.targets}: training needs torch: pip install 'tractor_ems[train]'"
         ) from None
     return one_thread()
 
