@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
+from tractor_ems.learning.knots_config import KnotsConfig
 from tractor_ems.learning.rewards import RewardConfig
 from tractor_msgs_py.errors import ConfigError
 from tractor_sim.config import describe
@@ -29,6 +30,7 @@ Widths = Annotated[tuple[Width, ...], Field(min_length=1, max_length=15)]
 ActivationName = Literal["relu", "tanh"]
 Targets = Literal["counterfactual", "sampled", "run_or_stand"]
 LossName = Literal["huber", "mse"]
+Parametrisation = Literal["p_batt_grid", "p_eng_knots"]
 
 
 @dataclass(frozen=True, config=_STRICT)
@@ -187,7 +189,7 @@ class RunOrStandConfig:
     augmentation: Augmentation = Augmentation()
 
 
-Mode: TypeAlias = CounterfactualConfig | SampledConfig | RunOrStandConfig
+Mode: TypeAlias = CounterfactualConfig | SampledConfig | RunOrStandConfig | KnotsConfig
 
 
 @dataclass(frozen=True, config=_STRICT)
@@ -209,7 +211,10 @@ class TrainConfig:
         interact: simulated episodes to add.
         mean_prior_s, low_pass_s: demand filters that the policy sees; ``run_or_stand`` has its
             own.
-        counterfactual, sampled, run_or_stand: settings of the modes.
+        parametrisation: of ``sampled``: the paper's grid over battery power, or ``p_eng_knots``,
+            off and knots of engine power, for engines that start slowly.
+        counterfactual, sampled, run_or_stand: settings of the modes; knots: of ``sampled`` with
+            ``p_eng_knots``.
         checkpoint_every: updates between checkpoints; the last one is always kept.
     """
 
@@ -226,6 +231,8 @@ class TrainConfig:
     counterfactual: CounterfactualConfig = CounterfactualConfig()
     sampled: SampledConfig = SampledConfig()
     run_or_stand: RunOrStandConfig = RunOrStandConfig()
+    parametrisation: Parametrisation = "p_batt_grid"
+    knots: KnotsConfig = KnotsConfig()
     checkpoint_every: Count = 1000
 
     def __post_init__(self) -> None:
@@ -245,7 +252,7 @@ class TrainConfig:
         """Settings of the chosen mode."""
         modes: dict[Targets, Mode] = {
             "counterfactual": self.counterfactual,
-            "sampled": self.sampled,
+            "sampled": self.sampled if self.parametrisation == "p_batt_grid" else self.knots,
             "run_or_stand": self.run_or_stand,
         }
         return modes[self.targets]
@@ -311,7 +318,10 @@ def load_train_config(
             _put(data, name.split("."), value)
     updates = (overrides or {}).get("updates")
     if updates is not None:
-        _put(data, [str(data.get("targets", "counterfactual")), "updates"], updates)
+        mode = str(data.get("targets", "counterfactual"))
+        if mode == "sampled" and data.get("parametrisation") == "p_eng_knots":
+            mode = "knots"
+        _put(data, [mode, "updates"], updates)
     try:
         return TypeAdapter(TrainConfig).validate_python(data)
     except ValidationError as error:

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tractor_ems.learning.augment import augmented
 from tractor_ems.learning.config import (
-    RunOrStandConfig,
+    CounterfactualConfig,
     SampledConfig,
     TrainConfig,
     step_discount,
@@ -44,6 +44,9 @@ from tractor_msgs_py.observation import ObservationSpec
 from tractor_msgs_py.trajectory import FloatArray
 from tractor_sim.powertrain import PowertrainParams
 
+if TYPE_CHECKING:
+    from tractor_ems.learning.knot_run import KnotRun
+
 
 @dataclass(frozen=True)
 class Experiment:
@@ -70,7 +73,7 @@ class Experiment:
     def policy(self, net: Mlp, metadata: dict[str, Any] | None = None) -> QPolicy:
         """The policy of a network of one of the two modes that choose among battery powers."""
         mode = self.config.mode
-        assert not isinstance(mode, RunOrStandConfig)
+        assert isinstance(mode, CounterfactualConfig | SampledConfig)
         return QPolicy(
             name="ddqn_counterfactual"
             if self.config.targets == "counterfactual"
@@ -288,12 +291,17 @@ class SampledRun:
 
 def begin(
     experiment: Experiment, generators: Generators
-) -> CounterfactualRun | RunOrStandRun | SampledRun:
+) -> "CounterfactualRun | RunOrStandRun | SampledRun | KnotRun":
     """The run of the chosen mode, at step 0."""
-    if experiment.config.targets == "counterfactual":
+    config = experiment.config
+    if config.targets == "counterfactual":
         return CounterfactualRun(experiment, generators)
-    if experiment.config.targets == "run_or_stand":
+    if config.targets == "run_or_stand":
         return RunOrStandRun(experiment, generators)
+    if config.parametrisation == "p_eng_knots":
+        from tractor_ems.learning.knot_run import KnotRun
+
+        return KnotRun(experiment, generators)
     return SampledRun(experiment, generators)
 
 

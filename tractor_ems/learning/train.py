@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from tractor_ems.learning.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
-from tractor_ems.learning.config import TrainConfig, learning_rate
+from tractor_ems.learning.config import SampledConfig, TrainConfig, learning_rate
 from tractor_ems.learning.recordings import Recordings, read_recordings
 from tractor_ems.learning.training_log import Report, training_log
 from tractor_msgs_py import __version__
@@ -243,7 +243,7 @@ def _one_thread(config: TrainConfig) -> AbstractContextManager[None]:
     Raises:
         ConfigError: torch is missing.
     """
-    if config.targets == "sampled":
+    if isinstance(config.mode, SampledConfig):
         return nullcontext()
     try:
         from tractor_ems.learning.networks import one_thread

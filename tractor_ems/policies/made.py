@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tractor_ems.policies import q_policy, run_or_stand_file, sdp_file
+from tractor_ems.policies import knot_q_file, q_policy, run_or_stand_file, sdp_file
 from tractor_ems.policies.mlp import Float32Array
 from tractor_ems.policies.policy_file import read_policy
 from tractor_ems.policies.protocol import MadePolicy
@@ -15,6 +15,7 @@ MAKERS: dict[str, Callable[[dict[str, Float32Array], dict[str, Any]], MadePolicy
     **dict.fromkeys(q_policy.KINDS, q_policy.policy_from),
     run_or_stand_file.KIND: run_or_stand_file.run_or_stand_from,
     sdp_file.KIND: sdp_file.sdp_from,
+    knot_q_file.KIND: knot_q_file.knot_q_from,
 }
 """Kind of policy to what makes one of tensors and metadata."""
 
