@@ -2,7 +2,7 @@
 
 import typer
 
-from tractor_ems.cli import bag, cycle, demo, dp, evaluate, study, train, vehicle
+from tractor_ems.cli import bag, cycle, demo, dp, evaluate, policy, study, train, tune, vehicle
 
 app = typer.Typer(
     name="ems",
@@ -18,5 +18,7 @@ app.command("evaluate")(evaluate.evaluate)
 app.command("dp")(dp.dp)
 app.add_typer(cycle.app, name="cycle")
 app.add_typer(bag.app, name="bag")
+app.add_typer(policy.app, name="policy")
 app.add_typer(study.app, name="study")
+app.add_typer(tune.app, name="tune")
 app.add_typer(vehicle.app, name="vehicle")
