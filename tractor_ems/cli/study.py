@@ -1,6 +1,6 @@
-"""``ems study``: reproduce the paper."""
+"""``ems study``: reproduce the paper; compare policies on held-out cycles."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
@@ -62,6 +62,68 @@ def paper(
         return
     for table in tables:
         print_table(table.title, table.columns, table.rows)
+
+
+@app.command("held-out")
+def held_out(
+    preset: Annotated[
+        str, typer.Option(help="Budget: smoke (minutes, means nothing) or full.")
+    ] = "smoke",
+    out: Annotated[
+        Path, typer.Option(help="Folder of bags, policies, pieces, report; kept and reused.")
+    ] = Path("out/study/held-out"),
+    report: Annotated[
+        Path | None, typer.Option(help="Markdown report; default OUT/PRESET/held_out.md.")
+    ] = None,
+    source: Annotated[
+        Path | None,
+        typer.Option("--from", help="Results to make the report of again; nothing is run."),
+    ] = None,
+    settings: Annotated[
+        str, typer.Option(help="config/study name or YAML file with every choice.")
+    ] = "held_out",
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes; default one per core.")
+    ] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Train on recorded runs, then score every policy on cycles that no training saw.
+
+    Ctrl-C loses what is under way; the same command goes on from what is finished. The report's
+    results are in data/STEM.json beside it, its figures in the folder STEM.
+    """
+    from tractor_ems.study.held_out import run_held_out
+    from tractor_ems.study.held_out_config import load_held_out
+    from tractor_ems.study.held_out_report import write_report
+    from tractor_ems.study.held_out_results import read_results, results_of
+    from tractor_ems.study.schedule import workers_of
+
+    target = report or out / preset / "held_out.md"
+    if target.suffix != ".md" or target.is_dir():
+        raise ConfigError(f"{target}: the report must be a file that ends in .md")
+    if source is not None:
+        results = read_results(source)
+    else:
+        config = load_held_out(settings, preset)
+        with _stages() as bars:
+
+            def stage(name: str, jobs: int) -> Callable[[int], None]:
+                bar = bars(name, jobs)
+                return lambda done: bar(done, [float(done)])
+
+            found = run_held_out(config, out / preset, workers=workers_of(workers), stage=stage)
+        results = results_of(found)
+    data = write_report(results, target)
+    NOTES.print(f"report: {target}")
+    verdicts = results["verdicts"]
+    if json:
+        print_json({"report": str(target), "results": str(data), "verdicts": verdicts})
+        return
+    rows = [
+        (item["bar"], item["wanted"], item["found"], "met" if item["met"] else "missed")
+        for item in verdicts
+    ]
+    print_table("held-out study", ("bar", "wanted", "found", "verdict"), rows)
 
 
 @contextmanager

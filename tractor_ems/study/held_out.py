@@ -21,8 +21,6 @@ from tractor_ems.study.held_out_transfer import transfer
 from tractor_ems.study.parallel import do_all
 from tractor_msgs_py import __version__
 
-ROUNDING = {"soc": 6, "kg": 7}
-
 Stage = Callable[[str, int], Callable[[int], None]]
 """Opens the progress of a stage of so many tasks; what it returns is told how many are done."""
 
@@ -77,8 +75,8 @@ def run_held_out(
         "curve": _curve(config, trained, len(main), out, do),
         "rows": rows,
         "traces": _traces(config, drivers, driven),
-        "robustness": _robustness(config, drivers, out, do),
-        "transfer": transferred,
+        "robustness_rows": _robustness(config, drivers, out, do),
+        "transfer_rows": transferred,
     }
 
 
@@ -88,6 +86,7 @@ def _trainings(
     """Every policy of the study, and those of the learning curve besides."""
     settings, budget = config.settings, config.budget
     powertrain, folder = settings.powertrain, out / "policies"
+    distinct = recorded[: len(config.training)]  # the first recorder's: every cycle once
     main = [
         training_of(
             learner.name,
@@ -116,7 +115,7 @@ def _trainings(
     return main, [
         training_of(
             learner.name,
-            _some(recorded, count),
+            _some(distinct, count),
             kind="learner",
             preset=learner.preset,
             powertrain=powertrain,
@@ -127,13 +126,13 @@ def _trainings(
         for learner in settings.learners
         if learner.name == settings.subject
         for count in budget.curve_bags
-        if count < len(recorded)
+        if count <= len(distinct)
         for seed in range(budget.curve_seeds)
     ]
 
 
 def _some(recorded: Sequence[Recorded], count: int) -> list[Recorded]:
-    """``count`` recordings spread evenly over all of them, so over operations."""
+    """``count`` recordings spread evenly over them, so over operations."""
     return [recorded[(2 * n + 1) * len(recorded) // (2 * count)] for n in range(count)]
 
 

@@ -1,5 +1,5 @@
-"""Sixth stage of the held-out study: the learned policy on other vehicles, as it is, with the right
-plant model, and trained anew, beside rules that were made for nobody."""
+"""Sixth stage of the held-out study: the learned policy on other vehicles, as it is, with the
+right plant model, and trained anew, beside rules that were made for nobody."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -58,7 +58,7 @@ def _trained(config: HeldOutConfig, out: Path, do: Do) -> list[Trained]:
         recordings += recordings_of(
             vehicle.powertrain,
             config.transfer_training,
-            settings.recorders,
+            settings.recorders[:1],
             vehicle.scale,
             out / "transfer" / vehicle.powertrain / "bags",
         )
