@@ -5,6 +5,9 @@ import hashlib
 import pytest
 
 from tractor_ems.evaluate import evaluate
+from tractor_ems.policies.card import card_of, markdown
+from tractor_ems.policies.envelope import stored_envelope
+from tractor_ems.policies.made import load_made
 from tractor_ems.policies.q_policy import load_policy
 from tractor_ems.policies.registry import policy_file
 from tractor_ems.scenario import make_scenario
@@ -14,11 +17,23 @@ from tractor_sim.duty_cycle.shipped import published_hashes
 from tractor_sim.powertrain_json import powertrain_hash
 
 FILE = policy_file("default", "paper")
+OTHERS = [path for path in sorted(FILE.parent.glob("*.safetensors")) if path != FILE]
+"""Of later powertrains; their cards are generated and their files know what training saw."""
 
 
 def test_the_card_names_the_file_by_its_hash():
     card = FILE.with_suffix(".md").read_text(encoding="utf-8")
     assert hashlib.sha256(FILE.read_bytes()).hexdigest() in card
+
+
+@pytest.mark.parametrize("file", OTHERS, ids=lambda path: path.stem)
+def test_the_others_know_their_envelope_and_have_the_card_that_the_command_writes(file):
+    made = load_made(file)
+    assert made.params == load_powertrain(file.stem)
+    assert stored_envelope(made.metadata)
+    train = {published_hashes()[name].sha256 for name in cycle_names("train")}
+    assert made.metadata["cycle_hashes"] and set(made.metadata["cycle_hashes"]) <= train
+    assert file.with_suffix(".md").read_text(encoding="utf-8") == markdown(card_of(file))
 
 
 def test_it_was_made_for_the_shipped_powertrain_from_training_cycles_alone():
