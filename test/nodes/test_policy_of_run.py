@@ -1,5 +1,6 @@
 """A learned policy without a file waits for a run, then is that powertrain's shipped one."""
 
+import json
 import signal
 from dataclasses import replace
 
@@ -21,6 +22,7 @@ from tractor_sim.config import load_powertrain
 VALUES = {
     **{parameter.name: parameter.default for parameter in ddqn_policy.PARAMETERS},
     "signals": "",
+    "report": "",
 }
 
 
@@ -67,6 +69,15 @@ def test_a_run_of_a_powertrain_without_a_shipped_policy_is_refused_by_name(
     graph.spin_until(lambda: logic._powertrain, "the run")
     with pytest.raises(PolicyError, match="none ships for powertrain 'wheel_loader'"):
         logic.finished()
+
+
+def test_a_wait_in_vain_leaves_a_report_of_its_own(graph, tmp_path):
+    report = tmp_path / "report.json"
+    report.write_text('{"ended": true, "policy": "of yesterday"}')
+    logic = PolicyOfRun(graph.node("ddqn_policy"), {**VALUES, "report": str(report)}, None)
+    assert json.loads(report.read_text()) == {"ended": False, "policy": ""}
+    logic.shutdown()
+    assert json.loads(report.read_text())["ended"]
 
 
 @pytest.mark.slow

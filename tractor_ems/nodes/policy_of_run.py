@@ -1,12 +1,14 @@
 """Waits for a run to say which powertrain it has, then is the node of that powertrain's policy."""
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
+from tractor_ems.drive_report import write_report
 from tractor_ems.nodes.driving_node import DrivingNode
 from tractor_msgs_py import topics
 from tractor_msgs_py.codec import decode_run_info
@@ -33,6 +35,7 @@ class PolicyOfRun:
         self._node, self._values, self._build = node, dict(values), build
         self._chosen: DrivingNode | None = None
         self._powertrain = ""
+        self._report(ended=False)
         self._run_info = subscribe_to(node, topics.RUN_INFO, self._on_run_info)
         self._diagnostics = publish_on(node, topics.DIAGNOSTICS)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -70,3 +73,10 @@ class PolicyOfRun:
         """As the policy does; nothing was said before there was one."""
         if self._chosen is not None:
             self._chosen.shutdown()
+        else:
+            self._report(ended=True)
+
+    def _report(self, *, ended: bool) -> None:
+        """A report of an earlier drive must not look like this one's."""
+        if self._values.get("report"):
+            write_report(Path(self._values["report"]), {"ended": ended, "policy": ""})
