@@ -12,15 +12,14 @@ import numpy as np
 from numba import njit
 
 from tractor_ems.optimal.one_step_kernel import (
-    BATTERY_SHARE,
-    BESIDE_SHARE,
-    HOLD_ON_W,
     Cell,
     best_power_w,
     fuel_at,
     parabola,
     soc_change,
 )
+from tractor_ems.policies.genset import HOLD_ON_W
+from tractor_ems.policies.one_step import ALONE_SHARE, BESIDE_SHARE
 from tractor_msgs_py.trajectory import FloatArray, IntArray
 
 SEARCH_EVERY = 25
@@ -146,7 +145,7 @@ def solve_chain(
         for z in range(zs):
             d = demand_w[z]
             least, most = _range_w(engine_max_w, limit_w, d)
-            forced = d > BATTERY_SHARE * limit_w
+            forced = d > ALONE_SHARE * limit_w
             for s in range(socs):
                 v, held = ocv_v[s], holding_kg[s] - baseline_kg[z]
                 if search:
