@@ -15,8 +15,10 @@ from tractor_ems.learning.config import (
 )
 from tractor_ems.learning.counterfactual import make_problem as make_counterfactual
 from tractor_ems.learning.run_or_stand import MOST_STARTS, RunOrStandLearner, make_problem
+from tractor_ems.learning.stretches import reserve
 from tractor_ems.learning.train import train
 from tractor_ems.policies.made import load_made
+from tractor_ems.policies.one_step import hold, not_held
 from tractor_ems.policies.q_policy import Normalisation
 from tractor_ems.policies.run_or_stand import (
     SLOPE_STEP,
@@ -28,11 +30,17 @@ from tractor_ems.policies.run_or_stand import (
 from tractor_ems.policies.run_or_stand_file import save_run_or_stand
 from tractor_ems.tuning import closed_loop
 from tractor_msgs_py.errors import ConfigError, PolicyError
-from tractor_msgs_py.observation import DemandFilter, ObservationSpec, filter_trace
+from tractor_msgs_py.observation import (
+    DemandFilter,
+    Observation,
+    ObservationSpec,
+    filter_trace,
+)
 from tractor_sim.batch import batch_plant
 from tractor_sim.config import load_powertrain
 
 FIELD = load_powertrain("field")
+BATTERY_W = FIELD.battery.power_max_w
 SPEC = ObservationSpec(dt_s=1.0, filters=(DemandFilter("low_pass", 8.0),))
 SCALING = Normalisation(80e3, 50e3, soc_scale=0.1)
 SMALL = RunOrStandConfig(updates=40, batch=16, errors=2, commit_s=6.0, hidden=(16, 16))
@@ -53,7 +61,7 @@ def inputs_of(demand_w):
 
 def learner(config=SMALL, seed=0):
     demand_w = work(900)
-    problem = make_problem(FIELD, config, [demand_w], inputs_of(demand_w))
+    problem = make_problem(FIELD, config, [demand_w], inputs_of(demand_w), 1)
     rngs = (np.random.Generator(np.random.PCG64(seed + n)) for n in (0, 100))
     return RunOrStandLearner(problem, config, *rngs)
 
@@ -85,6 +93,8 @@ def test_the_policy_drives_as_the_compiled_loop_does(config):
     policy = policy_of(made, other)
     run = drive(policy, FIELD, demand_w[None, :], 0.55, 0.55)[0]
     inputs, left_s = inputs_of(demand_w), 600.0 - np.arange(600)
+    at = inputs.shape[1]
+    inputs = np.concatenate((inputs, np.zeros((600, 2))), axis=1)
     if config.planned:
         inputs = np.concatenate((inputs, time_inputs(left_s, config.horizon_s)), axis=1)
     totals = np.zeros(9)
@@ -96,7 +106,7 @@ def test_the_policy_drives_as_the_compiled_loop_does(config):
     ]
     closed_loop.drive_choice(
         *batch_plant(FIELD), p.cell, p.fuel_kg, p.engine_max_w, demand_w, inputs.astype(float),
-        stiffness_kg(p.prices, left_s), 0.55, 0.55, p.prices.soc_kg, p.prices.start_kg,
+        at, stiffness_kg(p.prices, left_s), 0.55, 0.55, p.prices.soc_kg, p.prices.start_kg,
         p.prices.unit_kg, config.soc_scale if config.planned else 0.1, SLOPE_STEP, *stacked,
         totals, np.zeros((0, 3)),
     )  # fmt: skip
@@ -128,10 +138,26 @@ def test_standing_saves_the_fuel_of_idling_and_costs_no_start_while_it_lasts(con
 
 def test_what_the_battery_cannot_carry_alone_is_no_choice():
     made = learner()
-    made.problem.demand_w[:] = 148e3
+    made.problem.must_start[:] = True
     _, gain = made.backup(np.arange(20, 30), np.full(10, 1000), np.zeros((10, 1)))
     prices = made.problem.prices
     assert np.all(gain == -MOST_STARTS * prices.start_kg / prices.unit_kg)
+
+
+def test_the_reserve_in_training_is_the_one_that_drives():
+    """A running engine is forced or held at the same ticks, from the same memory."""
+    demand_w = np.concatenate((work(900), np.full(120, 100e3), work(300)))
+    found = reserve(demand_w, BATTERY_W, 60e3, slow=True)
+    state = not_held(1)
+    observed = Observation(
+        0, *np.full((3, 1), 0.55), np.ones(1, dtype=bool), np.full(1, 1e3), np.full(1, 50e3),
+        *np.full((3, 1), BATTERY_W), np.zeros((1, 0)),
+    )  # fmt: skip
+    for t, power_w in enumerate(demand_w):
+        must, state = hold(FIELD, replace(observed, power_demand_w=np.full(1, power_w)), state)
+        assert (must[0], state.since_s[0]) == (found.must_run[t], found.since_s[t])
+        assert state.peak_w[0] == pytest.approx(found.peak_w[t])
+    assert 0 < found.must_start.sum() < found.must_run.sum() < len(demand_w)
 
 
 def test_a_stretch_that_reaches_the_end_pays_for_the_soc_it_ends_at():
@@ -179,7 +205,7 @@ def test_a_file_gives_the_policy_back_and_refuses_what_does_not_fit(tmp_path):
         assert again.nets[0].weights[0].tobytes() == policy.nets[0].weights[0].tobytes()
         save_run_or_stand(tmp_path / "q.safetensors", replace(again, metadata={}))
         assert (tmp_path / "q.safetensors").read_bytes() == path.read_bytes()
-    with pytest.raises(PolicyError, match="network maps 3 inputs to 2 outputs"):
+    with pytest.raises(PolicyError, match="network maps 5 inputs to 2 outputs"):
         replace(policy, horizon_s=2400.0)
 
 

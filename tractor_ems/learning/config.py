@@ -153,6 +153,8 @@ class RunOrStandConfig:
         short_kg_per_j: price of demand left unmet.
         double: choose with the online net, evaluate with the averaged one.
         hidden: of the network, tanh.
+        table_updates: first updates whose targets go on with the values of stochastic DP, fitted
+            to the same demand, instead of the network's own; 0: none, nothing is fitted.
         low_pass_s, mean_prior_s: demand filters that the policy sees.
         augmentation: demand made from the recorded one.
     """
@@ -184,6 +186,7 @@ class RunOrStandConfig:
     short_kg_per_j: NotNegative = 2e-6
     double: bool = True
     hidden: tuple[Width, Width] = (64, 64)
+    table_updates: Annotated[int, Field(ge=0, le=100_000_000)] = 0
     low_pass_s: Annotated[tuple[Seconds, ...], Field(max_length=8)] = (8.0, 30.0, 120.0)
     mean_prior_s: Seconds = 600.0
     augmentation: Augmentation = Augmentation()

@@ -200,7 +200,9 @@ class RunOrStandRun:
         )
         self.demands_w = [*experiment.demands_w, *(servable_demand_w(params, d) for d in made)]
         samples = demand_samples(self.demands_w, experiment.spec, experiment.scaling, params.dt_s)
-        problem = make_problem(params, config, self.demands_w, samples.inputs)
+        problem = make_problem(
+            params, config, self.demands_w, samples.inputs, len(experiment.demands_w)
+        )
         self.prices = problem.prices
         self.learner = RunOrStandLearner(problem, config, generators.init, generators.sample)
         ticks = sum(len(demand_w) for demand_w in experiment.demands_w)

@@ -21,7 +21,7 @@ tick: what the rest of the work burns anyway, which varies far more, never enter
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,19 +37,22 @@ from tractor_ems.learning.networks import (
     net_tensors,
     to_numpy,
 )
-from tractor_ems.learning.stretches import baseline, stretches
+from tractor_ems.learning.sdp_table import Table, make_table
+from tractor_ems.learning.stretches import baseline, reserve, stretches
 from tractor_ems.optimal.one_step_kernel import Cell
 from tractor_ems.policies.genset import power_max_w, running_fuel_kg_per_s
 from tractor_ems.policies.mlp import Float32Array, Mlp
+from tractor_ems.policies.reserve import starts_slowly
 from tractor_ems.policies.run_or_stand import (
     SLOPE_STEP,
     Prices,
     prices_of,
+    reserve_inputs,
     stiffness_kg,
     time_inputs,
 )
 from tractor_msgs_py.errors import ConfigError
-from tractor_msgs_py.trajectory import FloatArray, IntArray
+from tractor_msgs_py.trajectory import BoolArray, FloatArray, IntArray
 from tractor_sim.battery import open_circuit_v
 from tractor_sim.powertrain import PowertrainParams
 
@@ -72,8 +75,10 @@ class Problem:
         dt_s: step length.
         demand_w: N ticks of demand, traces end to end; inputs: (N, 1 + F), as the network sees
             them; ticks: those after which a whole stretch is left of the same trace.
+        must_start, must_run: (N,), where a standing engine must start, a running one go on.
         baseline_kg: (N,), least cost of running at each tick: taken off, it keeps V small.
         commit, horizon: steps of a stretch; farthest time left, 0 without a planned end.
+        table: values of stochastic DP on the same demand, to begin with; or None.
     """
 
     cell: Cell
@@ -88,9 +93,12 @@ class Problem:
     demand_w: FloatArray
     inputs: Float32Array
     ticks: IntArray
+    must_start: BoolArray
+    must_run: BoolArray
     baseline_kg: FloatArray
     commit: int
     horizon: int
+    table: Table | None
 
 
 def make_problem(
@@ -98,8 +106,10 @@ def make_problem(
     config: RunOrStandConfig,
     demands_w: Sequence[FloatArray],
     inputs: Float32Array,
+    recorded: int,
 ) -> Problem:
-    """The problem of a powertrain and its demand series; ``inputs``: of all of them, end to end.
+    """The problem of a powertrain and its demand series; ``inputs``: of all of them, end to end;
+    the first ``recorded`` of them were recorded, the others made from those.
 
     Raises:
         ConfigError: no trace is longer than a stretch.
@@ -119,6 +129,13 @@ def make_problem(
     ocv_v = float(open_circuit_v(battery, np.array([params.soc_initial]))[0])
     prices = prices_of(params, config.price, config.end_kg if config.planned else 0.0)
     demand_w = np.concatenate(demands_w)
+    ramp_w = min(engine.ramp_w_per_s * dt_s, engine.power_max_w)
+    kept = [reserve(d, battery.power_max_w, ramp_w, starts_slowly(params)) for d in demands_w]
+    seen = [reserve_inputs(params, one.peak_w, one.since_s) for one in kept]
+    table = None
+    if config.table_updates:
+        table = make_table(params, config, demands_w, recorded)
+        prices = replace(prices, soc_kg=table.price_kg)
     return Problem(
         cell=cell,
         fuel_kg=fuel_kg,
@@ -127,16 +144,19 @@ def make_problem(
         ocv_v=ocv_v,
         prices=prices,
         min_off=round(engine.min_off_s / dt_s),
-        ramp_w=min(engine.ramp_w_per_s * dt_s, most_w),
+        ramp_w=min(ramp_w, most_w),
         dt_s=dt_s,
         demand_w=demand_w,
-        inputs=inputs,
+        inputs=np.concatenate((inputs, np.concatenate(seen)), axis=1),
         ticks=ticks,
+        must_start=np.concatenate([one.must_start for one in kept]),
+        must_run=np.concatenate([one.must_run for one in kept]),
         baseline_kg=baseline(
             cell, fuel_kg, most_w, battery.power_max_w, ocv_v, demand_w, prices.soc_kg
         ),
         commit=commit,
         horizon=round(config.horizon_s / dt_s) if config.planned else 0,
+        table=table,
     )
 
 
@@ -187,6 +207,22 @@ class RunOrStandLearner:
         found: FloatArray = stiff[:, None] * error * error
         return found
 
+    def best(
+        self, tick: IntArray, left: IntArray, error: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Cost to come of a running and of a standing engine at SOC errors (B, K) [units]: by
+        the table at first, then by the averaged network, the online one choosing."""
+        p = self.problem
+        if p.table is not None and self.step < self.config.table_updates:
+            on, off = p.table.values_kg(tick, p.dt_s * left.astype(np.float64), error)
+            return on / p.prices.unit_kg, off / p.prices.unit_kg
+        start = p.prices.start_kg / p.prices.unit_kg
+        v, g = self.values(self.target, tick, left, error)
+        choice = self.values(self.online, tick, left, error)[1] if self.config.double else g
+        on = np.where((choice > 0.0) & ~p.must_run[tick, None], v - g, v)
+        off = np.where((choice > -start) & ~p.must_start[tick, None], v - g, v + start)
+        return on, off
+
     def backup(
         self, tick: IntArray, left: IntArray, error: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
@@ -194,8 +230,7 @@ class RunOrStandLearner:
         p, c, prices = self.problem, self.config, self.problem.prices
         b, k = error.shape
         near = (error[..., None] + np.array([-SLOPE_STEP, SLOPE_STEP])).reshape(b, 2 * k)
-        v, g = self.values(self.target, tick, left, near)
-        on = np.minimum(v, v - g).reshape(b, k, 2)
+        on = self.best(tick, left, near)[0].reshape(b, k, 2)
         slope = (on[..., 1] - on[..., 0]) / (2.0 * SLOPE_STEP) * prices.unit_kg
         steps = np.minimum(left, p.commit) if p.horizon else np.full(b, p.commit)
         cost, end, end_on = np.empty((3, b * k, 2))
@@ -204,15 +239,13 @@ class RunOrStandLearner:
             p.cell, p.fuel_kg, p.engine_max_w, p.limit_w, p.ocv_v, p.demand_w, p.baseline_kg,
             np.repeat(tick, k), np.repeat(steps, k), error.ravel(), slope.ravel(), prices.soc_kg,
             prices.start_kg, gamma, p.min_off, p.ramp_w, c.short_kg_per_j * p.dt_s, self.holding,
-            cost, end, end_on,
+            p.must_start, cost, end, end_on,
         )  # fmt: skip
         start = prices.start_kg / prices.unit_kg
         after, end = tick + steps, end.reshape(b, 2 * k)
         then_left = left - steps
-        v, g = self.values(self.target, after, then_left, end)
-        choice = self.values(self.online, after, then_left, end)[1] if c.double else g
-        restart = np.where(end_on.reshape(b, 2 * k) > 0, 0.0, start)
-        then = np.where(choice > -restart, v - g, v + restart)
+        on, off = self.best(after, then_left, end)
+        then = np.where(end_on.reshape(b, 2 * k) > 0, on, off)
         if p.horizon:
             over = (then_left == 0)[:, None]
             then = np.where(over, self.known(then_left, end), then)
@@ -246,6 +279,8 @@ class RunOrStandLearner:
         out = self.online(torch.from_numpy(rows)).reshape(*error.shape, 2)
         miss_v = out[..., 0] - torch.from_numpy(y_v.astype(np.float32))
         miss_g = out[..., 1] - torch.from_numpy(y_g.astype(np.float32))
+        # Where it cannot stand nobody asks what standing saves.
+        miss_g = miss_g * torch.from_numpy(~self.problem.must_start[tick, None])
         common = miss_v.mean(dim=1, keepdim=True)
         loss = ((miss_v - common) ** 2).mean() + c.gain_weight * (miss_g**2).mean()
         if c.level_weight:

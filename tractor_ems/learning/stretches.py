@@ -2,19 +2,24 @@
 they lead. Compiled: hundreds per gradient step.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
 from tractor_ems.optimal.one_step_kernel import (
+    NOT_HELD,
     Cell,
     best_power_w,
     fuel_at,
+    hold,
     parabola,
     soc_change,
 )
 from tractor_ems.policies.genset import HOLD_ON_W
-from tractor_ems.policies.one_step import ALONE_SHARE, BESIDE_SHARE
-from tractor_msgs_py.trajectory import FloatArray, IntArray
+from tractor_ems.policies.one_step import BESIDE_SHARE
+from tractor_msgs_py.trajectory import BoolArray, FloatArray, IntArray
+from tractor_sim.batch_kernel import Bounds
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -49,11 +54,11 @@ def stretches(
     demand_w: FloatArray, baseline_kg: FloatArray, tick: IntArray, steps: IntArray,
     error: FloatArray, slope_kg: FloatArray, price_kg: float, start_kg: float, gamma: float,
     min_off: int, ramp_w: float, short_kg_per_w: float, holding: FloatArray,
-    cost: FloatArray, end: FloatArray, end_on: FloatArray,
+    must_start: BoolArray, cost: FloatArray, end: FloatArray, end_on: FloatArray,
 ) -> None:  # fmt: skip
     """Cost (B, 2) of running and standing from ``tick`` for so many ``steps``, SOC errors after
-    them, and whether the engine runs then; what stands is started where the battery should not
-    carry the load alone, as fast as the real engine can. inf: it cannot stand at all."""
+    them, and whether the engine runs then; what stands is started where ``must_start``
+    says so, as fast as the real engine can. inf: it cannot stand at all."""
     for i in range(len(tick)):
         per_soc = price_kg - slope_kg[i]
         for way in range(2):
@@ -61,7 +66,7 @@ def stretches(
             ready_w = engine_max_w  # what the engine can give: less after a restart
             for k in range(steps[i]):
                 d = demand_w[tick[i] + k]
-                if not on and d > ALONE_SHARE * limit_w:
+                if not on and must_start[tick[i] + k]:
                     if k == 0:
                         total = np.inf
                         break
@@ -88,6 +93,41 @@ def stretches(
                 e += change
                 weight *= gamma
             cost[i, way], end[i, way], end_on[i, way] = total, e, on
+
+
+class Reserve(NamedTuple):
+    """What ``policies.one_step.hold`` says at every tick of a trace, (T,): whether an engine that
+    stands must start, whether one that runs must go on, and what it remembers then."""
+
+    must_start: BoolArray
+    must_run: BoolArray
+    peak_w: FloatArray
+    since_s: FloatArray
+
+
+def reserve(demand_w: FloatArray, limit_w: float, ramp_w: float, slow: bool) -> Reserve:
+    """The reserve along demand, the battery's limit being what it mostly is; steps of 1 s.
+    An engine that is not ``slow`` needs none."""
+    steps = len(demand_w)
+    found = Reserve(
+        np.zeros(steps, dtype=np.bool_), np.zeros(steps, dtype=np.bool_),
+        np.full(steps, NOT_HELD.peak_w), np.full(steps, NOT_HELD.since_s),
+    )  # fmt: skip
+    if slow:
+        _reserve(demand_w, limit_w, ramp_w, *found)
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def _reserve(
+    demand_w: FloatArray, limit_w: float, ramp_w: float, must_start: BoolArray,
+    must_run: BoolArray, peak_w: FloatArray, since_s: FloatArray,
+) -> None:  # fmt: skip
+    held, bounds = NOT_HELD, Bounds(limit_w, limit_w, 0.0, 0.0, True, 0.0)
+    for t in range(len(demand_w)):
+        must_start[t], _ = hold(bounds, ramp_w, demand_w[t], False, held)
+        must_run[t], held = hold(bounds, ramp_w, demand_w[t], True, held)
+        peak_w[t], since_s[t] = held.peak_w, held.since_s
 
 
 def baseline(

@@ -12,6 +12,7 @@ import numpy as np
 from tractor_ems.policies.genset import power_max_w, running_fuel_kg_per_s
 from tractor_ems.policies.mlp import Float32Array, Mlp, forward
 from tractor_ems.policies.one_step import (
+    HOLD_S,
     Held,
     cheapest,
     command_of,
@@ -31,6 +32,8 @@ SLOPE_STEP = 0.01
 
 SHORT_S, MIDDLE_S = 120.0, 600.0
 """Scales on which the network sees time running out, beside the whole horizon."""
+
+TIME_INPUTS = 3
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,18 @@ def time_inputs(time_left_s: FloatArray, horizon_s: float) -> Float32Array:
     return np.stack(columns, axis=1).astype(np.float32)
 
 
+RESERVE_INPUTS = 2
+
+
+def reserve_inputs(
+    params: PowertrainParams, peak_w: FloatArray, since_s: FloatArray
+) -> Float32Array:
+    """What holding an engine remembers, (B,) each, as network inputs (B, 2): how far the recent
+    peak is beyond the battery, how lately demand was that only an engine makes safe."""
+    beyond = np.clip(peak_w / params.battery.power_max_w - 1.0, -1.0, 1.0)
+    return np.stack((beyond, np.exp(-since_s / HOLD_S)), axis=1).astype(np.float32)
+
+
 @dataclass(frozen=True)
 class RunOrStand:
     """Runs or stands by the sign of the mean G of its networks; see ``learning.run_or_stand``.
@@ -99,8 +114,8 @@ class RunOrStand:
     Attributes:
         params: the powertrain it was made for.
         spec: demand filters that it sees.
-        nets: networks of (demand inputs, time inputs, SOC error) with outputs V and G [units];
-            more than one are averaged.
+        nets: networks of (demand inputs, reserve inputs, time inputs, SOC error) with outputs V
+            and G [units]; more than one are averaged.
         scaling: input normalisation.
         prices: see :class:`Prices`.
         horizon_s: farthest time left that it knows; 0: it knows of no planned end.
@@ -120,7 +135,8 @@ class RunOrStand:
     def __post_init__(self) -> None:
         if not (np.isfinite(self.horizon_s) and self.horizon_s >= 0.0):
             raise PolicyError(f"horizon_s: {self.horizon_s}, must be finite and >= 0")
-        wanted = (2 + len(self.spec.filters) + (3 if self.horizon_s else 0), 2)
+        known = RESERVE_INPUTS + (TIME_INPUTS if self.horizon_s else 0)
+        wanted = (2 + len(self.spec.filters) + known, 2)
         for net in self.nets:
             if (net.inputs, net.outputs) != wanted:
                 raise PolicyError(
@@ -142,14 +158,21 @@ class RunOrStand:
     def act(self, observation: Observation, state: Held) -> tuple[Command, Held]:
         """Run at the cheapest power, or stand."""
         params, demand_w = self.params, observation.power_demand_w
-        inputs = demand_inputs(self.scaling, demand_w, observation.features)
+        kept, held = hold(params, observation, state)
+        inputs = np.concatenate(
+            (
+                demand_inputs(self.scaling, demand_w, observation.features),
+                reserve_inputs(params, held.peak_w, held.since_s),
+            ),
+            axis=1,
+        )
         left_s = np.broadcast_to(observation.time_left_s, demand_w.shape)
         stiff_kg = np.zeros(demand_w.shape)
         if self.horizon_s:
             inputs = np.concatenate((inputs, time_inputs(left_s, self.horizon_s)), axis=1)
             stiff_kg = stiffness_kg(self.prices, np.clip(left_s, 0.0, self.horizon_s))
         v, g = self._values(inputs, observation.soc, observation.soc_target)
-        value = np.minimum(v, v - g) * self.prices.unit_kg
+        value = np.where(kept[:, None], v, np.minimum(v, v - g)) * self.prices.unit_kg
         slope = (value[:, 2] - value[:, 0]) / (2.0 * SLOPE_STEP)
         slope += 2.0 * stiff_kg * (observation.soc - observation.soc_target)
         per_soc = (self.prices.soc_kg - slope)[:, None]
@@ -163,7 +186,6 @@ class RunOrStand:
 
         least_w, most_w, may_run, may_be_off = running_range_w(params, observation)
         engine_w, _ = cheapest(params, demand_w, least_w, most_w, after)
-        kept, held = hold(params, observation, state)
         wants = g[:, 1] < np.where(
             observation.engine_on, 0.0, -self.prices.start_kg / self.prices.unit_kg
         )

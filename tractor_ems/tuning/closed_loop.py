@@ -23,6 +23,7 @@ from tractor_ems.optimal.one_step_kernel import (
     soc_change,
 )
 from tractor_ems.policies.genset import HOLD_ON_W
+from tractor_ems.policies.one_step import HOLD_S
 from tractor_msgs_py.trajectory import FloatArray, IntArray
 from tractor_sim.batch_kernel import Bounds, Plant, Segments, advance, bounds_of, fuel_of
 
@@ -120,14 +121,17 @@ def drive_table(
 @njit(cache=True, error_model="numpy")
 def drive_choice(
     plant: Plant, knots: FloatArray, segments: Segments, cell: Cell, fuel_kg: FloatArray,
-    engine_max_w: float, demand_w: FloatArray, inputs: FloatArray, stiff_kg: FloatArray,
-    soc0: float, target: float, price_kg: float, start_kg: float, unit_kg: float,
-    soc_scale: float, slope_step: float, w0: FloatArray, b0: FloatArray, w1: FloatArray,
-    b1: FloatArray, w2: FloatArray, b2: FloatArray, totals: FloatArray, trace: FloatArray,
+    engine_max_w: float, demand_w: FloatArray, inputs: FloatArray, at: int,
+    stiff_kg: FloatArray, soc0: float, target: float, price_kg: float, start_kg: float,
+    unit_kg: float, soc_scale: float, slope_step: float, w0: FloatArray, b0: FloatArray,
+    w1: FloatArray, b1: FloatArray, w2: FloatArray, b2: FloatArray, totals: FloatArray,
+    trace: FloatArray,
 ) -> None:  # fmt: skip
     """A network of (V, G) over (inputs, SOC error), see ``learning.run_or_stand``; several of one
     shape may be laid one after another along the first axis of ``w0`` .. ``b2``: their mean
-    decides. ``stiff_kg`` (T,): the known part of V per SOC error squared [kg]."""
+    decides. ``inputs`` (T, n): all but the SOC error; columns ``at`` and ``at`` + 1 are filled in
+    here with what the reserve remembers. ``stiff_kg`` (T,): the known part of V per SOC error
+    squared [kg]."""
     run = _begin(soc0, totals)
     nets, width, features = w0.shape[0], w0.shape[1], inputs.shape[1]
     first, hidden = np.empty(width), np.empty(width)
@@ -136,6 +140,8 @@ def drive_choice(
         d = demand_w[t]
         run, b = _look(plant, knots, segments, run, d)
         error = float(np.float32(run.soc)) - target
+        inputs[t, at] = min(max(run.held.peak_w / cell.unit_w - 1.0, -1.0), 1.0)
+        inputs[t, at + 1] = math.exp(-run.held.since_s / HOLD_S)
         v[:], g[:] = 0.0, 0.0
         for n in range(nets):
             for i in range(width):
@@ -143,9 +149,9 @@ def drive_choice(
                 for j in range(features):
                     first[i] += w0[n, i, j] * inputs[t, j]
             for k in range(3):
-                at = (error + (k - 1) * slope_step) / soc_scale
+                place = (error + (k - 1) * slope_step) / soc_scale
                 for i in range(width):
-                    hidden[i] = math.tanh(first[i] + w0[n, i, features] * at)
+                    hidden[i] = math.tanh(first[i] + w0[n, i, features] * place)
                 out_v, out_g = b2[n, 0], b2[n, 1]
                 for i in range(b1.shape[1]):
                     total = b1[n, i]
@@ -156,8 +162,8 @@ def drive_choice(
                     out_g += w2[n, 1, i] * total
                 v[k] += out_v / nets
                 g[k] += out_g / nets
-        low = min(v[0], v[0] - g[0])
-        high = min(v[2], v[2] - g[2])
+        low = v[0] if run.must else min(v[0], v[0] - g[0])
+        high = v[2] if run.must else min(v[2], v[2] - g[2])
         per_soc = price_kg - (high - low) / (2.0 * slope_step) * unit_kg
         per_soc -= 2.0 * stiff_kg[t] * error
         least, most = engine_range_w(b, d)
