@@ -45,9 +45,9 @@ class Interference:
         if not np.all(np.isfinite(self.demand_noise_w)):
             raise ConfigError("interference.demand_noise_w: not finite, allowed finite")
         for name, least in (("soc_bias", -1.0), ("delay_steps", 0.0), ("end_factor", 1e-9)):
-            worst = float(np.min(getattr(self, name), initial=np.inf))
-            if not worst >= least:
-                raise ConfigError(f"interference.{name}: {worst}, allowed >= {least:g}")
+            value = getattr(self, name)
+            if not np.all(value >= least):
+                raise ConfigError(f"interference.{name}: {value.min()}, allowed >= {least:g}")
 
 
 def drive(

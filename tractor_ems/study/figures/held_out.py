@@ -97,10 +97,9 @@ def _ratios(results: Results) -> Figure:
             color=VERMILION if own else GREY,
             linewidths=0,
         )
-        axes.boxplot(
-            scores, positions=[place], vert=False, widths=0.6, showfliers=False,
-            medianprops={"color": BLUE, "linewidth": 1.8}, manage_ticks=False,
-        )  # fmt: skip
+        low, middle, high = np.quantile(scores, (0.25, 0.5, 0.75))
+        axes.hlines(place, low, high, color=BLACK, linewidth=1.2)
+        axes.plot(middle, place, "|", color=BLUE, markersize=14, markeredgewidth=2.2)
     bars = results["settings"]["bars"]
     axes.axvline(bars["median"], color=BLUE, linestyle="--", linewidth=1)
     axes.axvline(bars["worst"], color=VERMILION, linestyle=":", linewidth=1)
@@ -268,8 +267,8 @@ def _traces(results: Results) -> Figure:
 FIGURES = {
     "ratios": (
         _ratios,
-        "Score of every run by policy, best median first; dashed: the bar of the median, dotted: "
-        "of the worst. Failed runs lie left of the axis.",
+        "Score of every run by policy, best median first, with quartiles; dashed: the bar of the "
+        "median, dotted: of the worst. Failed runs lie left of the axis.",
     ),
     "profile": (_profile, "Share of runs that score at least so much."),
     "operations": (_operations, "Median (dot) and worst (triangle) by operation."),
