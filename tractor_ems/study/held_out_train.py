@@ -3,7 +3,7 @@
 import resource
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -11,16 +11,24 @@ from typing import Any, Literal
 from tractor_ems.learning.config import TrainConfig, load_train_config
 from tractor_ems.learning.recordings import Recordings, distinct_demands, read_recordings
 from tractor_ems.learning.train import train_on
-from tractor_ems.optimal.sdp_fit import SdpSettings, fit_sdp
+from tractor_ems.policies.envelope import envelope_of
 from tractor_ems.policies.sdp_file import save_sdp
 from tractor_ems.study.held_out_record import Recorded
 from tractor_ems.study.pieces import code_digest, digest_of, digest_of_file, load_piece, save_piece
+from tractor_ems.tuning.sdp_bags import sdp_of_demand, sdp_settings
 from tractor_msgs_py import __version__
 from tractor_msgs_py.errors import RunAborted
 from tractor_sim.config import load_powertrain
 from tractor_sim.powertrain_json import powertrain_hash
 
-_CODE = ("tractor_ems/learning", "tractor_ems/optimal", "tractor_ems/policies", "tractor_sim")
+_CODE = (
+    "tractor_ems/learning",
+    "tractor_ems/optimal",
+    "tractor_ems/policies",
+    "tractor_ems/tuning/sdp_bags.py",
+    "tractor_ems/tuning/squeeze.py",
+    "tractor_sim",
+)
 
 COMMAND = "ems study held-out"
 """What policy files name as the command that made them: workers have none of their own."""
@@ -58,10 +66,13 @@ class Training:
     @property
     def key(self) -> str:
         """Hash of everything that decides the policy."""
-        settings: Any = {"planned": self.planned}
-        if self.kind == "learner":
-            settings = train_config(self).to_json()
-        powertrain = powertrain_hash(load_powertrain(self.powertrain))
+        params = load_powertrain(self.powertrain)
+        settings = (
+            train_config(self).to_json()
+            if self.kind == "learner"
+            else asdict(sdp_settings(params, planned=self.planned))
+        )
+        powertrain = powertrain_hash(params)
         made = [self.name, self.kind, self.seed, settings, powertrain, self.bags_key]
         return digest_of([*made, code_digest(*_CODE)])
 
@@ -158,16 +169,20 @@ def train(task: Training) -> Trained:
 
 def _fit_table(task: Training, recordings: Recordings) -> None:
     params = load_powertrain(task.powertrain)
-    settings = SdpSettings(planned=task.planned)
-    policy = fit_sdp(params, distinct_demands(recordings.traces), settings)
+    settings = sdp_settings(params, planned=task.planned)
+    demands_w = distinct_demands(recordings.traces)
+    policy = sdp_of_demand(params, demands_w, settings)
+    window = (params.battery.soc_min, params.battery.soc_max)
     metadata = {
         "package_version": __version__,
         "command_line": COMMAND,
+        "config": asdict(settings),
         "bag_hashes": recordings.bag_hashes,
         "cycle_hashes": recordings.cycle_hashes,
         "cycles": recordings.cycles,
+        "envelope": envelope_of(policy.spec, demands_w, params.dt_s, window),
     }
-    save_sdp(task.out, replace(policy, name=task.name, metadata=metadata))
+    save_sdp(task.out, replace(policy, metadata=metadata))
 
 
 @lru_cache(maxsize=1)
