@@ -11,10 +11,14 @@ import numpy as np
 
 from tractor_msgs_py.observation import Observation
 
-HOLD_S = 300.0
+HOLD_S = 60.0
 """Time left that a policy is told once the planned end has passed: it then keeps SOC at the target
-as if the work ended in so long, again and again [s]. With a single step left no policy would
-ever start an engine."""
+as if the work ended in so long, again and again [s].
+
+Stochastic DP on eight operations of `field`, half an hour past the end: |SOC error| p95 0.22 with
+a single step left, for which it never starts an engine; 0.030 with 30 s, 0.040 with 60 s, 0.067
+with 120 s, 0.14 with 300 s, at 11, 8, 6 and 4 engine starts an hour.
+"""
 
 
 @dataclass(frozen=True, slots=True)
