@@ -13,7 +13,7 @@ endif
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test test-slow measure lint format shipped-policy clean
+.PHONY: help venv demo test test-slow measure lint format shipped-policy field-card clean
 
 help:
 	@echo 'make demo       record experts, learn from their bags, drive the plant: out/demo'
@@ -81,6 +81,10 @@ shipped-policy: $(STAMP)
 	    --record out/shipped/$${policy}_planter_$$seed >/dev/null || exit; done; done
 	$(BIN)/ems train --bags out/shipped --out out/shipped/paper.safetensors
 	mkdir -p $(SHIPPED) && cp out/shipped/paper.safetensors $(SHIPPED)/
+
+# The card of the field policy, with its scores in the held-out study.
+field-card: $(STAMP)
+	$(BIN)/ems policy card field --scores docs/data/held_out.json --out $(SHIPPED)/field.md
 
 clean:
 	rm -rf $(VENV) build dist install log out/demo *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

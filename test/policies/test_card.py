@@ -59,9 +59,12 @@ def test_scores_come_from_beside_the_file_or_from_its_metadata(policy_with, tmp_
     assert card_of(path).scores == {"median": 0.99}
     beside = tmp_path / "mine.scores.json"
     mine = {"median": 0.996, "ci95": [0.995, 0.997], "worst": None}
-    beside.write_text(json.dumps({"policies": {"ddqn_counterfactual": mine, "sdp": {}}}))
+    study = {"policies": {"ddqn_counterfactual": mine, "sdp": {}}}
+    study["per_operation"] = {"ddqn_counterfactual": {"baler": {"median": 0.993, "worst": 0.98}}}
+    beside.write_text(json.dumps(study))
     card = card_of(path)
     assert card.scores == mine
+    assert "| baler | 0.993 | 0.98 | - | - |" in markdown(card)
     assert "| ci95 | 0.995 .. 0.997 |" in markdown(card) and "| worst | - |" in markdown(card)
     assert "No scores" not in markdown(card)
     beside.write_text(json.dumps({"policies": {"sdp": {}}}))

@@ -19,6 +19,9 @@ SCORES_SUFFIX = ".scores.json"
 """Of the file beside a policy that holds its scores, in the shape of ``docs/data/held_out.json``
 or a plain object of numbers."""
 
+OPERATION_KEYS = ("median", "worst", "starts_per_h", "soc_error_max")
+"""What the card shows of each operation."""
+
 
 @dataclass(frozen=True)
 class Card:
@@ -36,6 +39,7 @@ class Card:
         cycles, bag_hashes: what it was trained on.
         training: figures of the training.
         scores: how good it was; empty where nobody says.
+        operations: the same for each operation.
     """
 
     file: str
@@ -57,6 +61,7 @@ class Card:
     bag_hashes: tuple[str, ...]
     training: dict[str, Any]
     scores: dict[str, Any]
+    operations: dict[str, dict[str, Any]]
 
     def to_json(self) -> dict[str, Any]:
         """Plain data, the limits included."""
@@ -79,6 +84,7 @@ def card_of(path: Path, scores: Path | None = None) -> Card:
     times_s = [float(data.get("horizon_s", 0.0)), *map(float, data.get("times_s", ()))]
     horizon_s = 0.0 if policy.name.endswith("unplanned") else max(times_s)
     seed = data.get("seed")
+    found, operations = _scores(path, policy.name, data, scores)
     return Card(
         file=path.name,
         sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
@@ -98,15 +104,19 @@ def card_of(path: Path, scores: Path | None = None) -> Card:
         cycles=tuple(map(str, data.get("cycles", ()))),
         bag_hashes=tuple(map(str, data.get("bag_hashes", ()))),
         training=dict(data.get("training", {})),
-        scores=_scores(path, policy.name, data, scores),
+        scores=found,
+        operations=operations,
     )
 
 
-def _scores(path: Path, name: str, data: Mapping[str, Any], given: Path | None) -> dict[str, Any]:
+def _scores(
+    path: Path, name: str, data: Mapping[str, Any], given: Path | None
+) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """Scores over all, and by operation."""
     beside = path.with_suffix(SCORES_SUFFIX)
     file = given or (beside if beside.is_file() else None)
     if file is None:
-        return dict(data.get("scores", {}))
+        return dict(data.get("scores", {})), {}
     try:
         document = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -116,7 +126,8 @@ def _scores(path: Path, name: str, data: Mapping[str, Any], given: Path | None) 
         found = found.get(name)
     if not isinstance(found, dict):
         raise ConfigError(f"{file}: holds no scores of policy {name}")
-    return found
+    operations = document.get("per_operation", {}).get(name, {}) if found is not document else {}
+    return found, operations
 
 
 def limits_of(card: Card) -> tuple[str, ...]:
@@ -178,6 +189,12 @@ def markdown(card: Card) -> str:
     if card.scores:
         shown = [(key, _shown(value)) for key, value in card.scores.items()]
         parts += ["## Scores", _table(("quantity", "value"), shown)]
+    if card.operations:
+        rows_of = [
+            (name, *(_shown(own.get(key)) for key in OPERATION_KEYS))
+            for name, own in card.operations.items()
+        ]
+        parts += [_table(("operation", *OPERATION_KEYS), rows_of)]
     parts += ["## Limits", "\n".join(f"- {limit}" for limit in limits_of(card))]
     parts += [
         "## Trained on",
@@ -207,7 +224,8 @@ def _shown(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}" if math.isfinite(value) else str(value)
     if isinstance(value, list | tuple):
-        return " .. ".join(_shown(item) for item in value)
+        between = " .. " if len(value) == 2 else ", "
+        return between.join(_shown(item) for item in value)
     if isinstance(value, dict):
         return ", ".join(f"{key} {_shown(item)}" for key, item in value.items())
     return str(value)
