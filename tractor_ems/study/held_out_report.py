@@ -73,7 +73,7 @@ def page_of(results: Results, stem: str, figures: Mapping[str, str]) -> str:
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table, its first column to the left."""
     rule = ["---", *["---:"] * (len(heads) - 1)]
-    lines = [list(heads), rule, *[list(row) for row in rows]]
+    lines = [list(heads), rule, *[[cell.replace("|", "\\|") for cell in row] for row in rows]]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 

@@ -183,7 +183,8 @@ def _curve(results: Results) -> Figure:
         if not points:
             say_not_run(axes, "learning curve")
             continue
-        axes.set_xscale("log")
+        if key != "seconds":
+            axes.set_xscale("log")
         for what, colour, mark in (("median", BLUE, "o"), ("worst", VERMILION, "v")):
             x = [item[key] for item in points]
             y = [_of(item["dp_ratio"], what) for item in points]
