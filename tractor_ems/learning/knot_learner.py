@@ -28,7 +28,7 @@ from tractor_ems.learning.networks import (
     to_numpy,
 )
 from tractor_ems.learning.rewards import RewardConfig, battery_price, start_cost
-from tractor_ems.policies.knot_q import OFF, Feasible, knot_inputs
+from tractor_ems.policies.knot_q import OFF, STATE_INPUTS, Feasible, knot_inputs
 from tractor_ems.policies.mlp import Float32Array, Mlp
 from tractor_ems.policies.q_policy import Normalisation
 from tractor_msgs_py.errors import ConfigError
@@ -75,10 +75,12 @@ class MeasuredCost:
 
     Attributes:
         step_kg: fuel, start and price of battery energy less the baseline, (N,).
+        start_kg: what of this is a start, (N,).
         soc, soc_next, after: see ``KnotSamples``.
     """
 
     step_kg: FloatArray
+    start_kg: FloatArray
     soc: FloatArray
     soc_next: FloatArray
     after: IntArray
@@ -102,8 +104,9 @@ def measured_cost(
     low_w, high_w = np.min(samples.power_demand_w), np.max(samples.power_demand_w)
     points_w = np.linspace(low_w, max(high_w, low_w + 1.0), BASELINE_POINTS)
     base_kg = running_baseline_kg(samples.power_demand_w, running_kg, points_w, on & ~started)
-    step_kg = running_kg + np.where(started, start_kg, 0.0) - base_kg
-    return MeasuredCost(step_kg, samples.soc, samples.soc_next, samples.after)
+    starts_kg = np.where(started, start_kg, 0.0)
+    step_kg = running_kg + starts_kg - base_kg
+    return MeasuredCost(step_kg, starts_kg, samples.soc, samples.soc_next, samples.after)
 
 
 def n_step_returns(
@@ -129,7 +132,7 @@ def n_step_returns(
     step_kg = (cost.step_kg[place] + wall_kg) * np.where(inside, gamma**index, 0.0)
     end = tick + steps - 1
     error_end = cost.soc_next[end] - target
-    total_kg = step_kg.sum(axis=1)
+    total_kg = step_kg.sum(axis=1) - cost.start_kg[tick]
     final_kg = config.end_kg_per_soc2 * error_end**2
     total_kg = total_kg + np.where(over, gamma**steps * final_kg, 0.0)
     return Returns(
@@ -181,6 +184,7 @@ class KnotLearner:
     ) -> None:
         self.samples, self.config, self.scaling = samples, config, scaling
         self.dt_s, self.unit_kg = params.dt_s, reward.cost_unit
+        self.start_units = start_cost(reward, params) / self.unit_kg
         self.cost = measured_cost(samples, params, reward)
         self.demos = np.flatnonzero(samples.expert & samples.planned)
         if not len(self.demos) and config.demo_share > 0.0:
@@ -190,7 +194,7 @@ class KnotLearner:
         self.mask = Feasible(samples.off, samples.first, samples.last).mask(config.knots)
         self.rng, self.step = sample_rng, 0
         extra = 1 if config.dueling else 0
-        inputs = samples.demand.shape[1] + 5
+        inputs = samples.demand.shape[1] + STATE_INPUTS
         sizes = (inputs, *config.hidden, 1 + config.knots + extra)
         self.online = Net(sizes, config.activation, init_rng)
         self.target = Net(sizes, config.activation, init_rng)
@@ -239,16 +243,34 @@ class KnotLearner:
             self.scaling,
             s.demand[tick],
             error,
-            s.engine_on[tick],
-            s.engine_share[tick],
             left_s,
             self.config.horizon_s,
         )
 
+    def start_from(self, tick: IntArray) -> Tensor:
+        """What running costs more than the network says, where the engine is off, (B, 1 + K)."""
+        units = np.zeros((len(tick), 1 + self.config.knots), np.float32)
+        units[:, 1:] = np.where(self.samples.engine_on[tick], 0.0, self.start_units)[:, None]
+        return torch.from_numpy(units)
+
     def q(self, net: Net, inputs: Float32Array) -> Tensor:
-        """Q of every output."""
+        """Q of every output as if the engine were on."""
         values = net(torch.from_numpy(inputs))
         return values[:, :-1] + VALUE_SCALE * values[:, -1:] if self.config.dueling else values
+
+    @torch.no_grad()
+    def aims(self, tick: IntArray, target: FloatArray, left: IntArray) -> Tensor:
+        """What Q of the recorded actions should be, (B,)."""
+        returns = n_step_returns(
+            self.cost, self.config, self.unit_kg, self.dt_s, tick, target, left
+        )
+        after = self.inputs(returns.tick, returns.error, returns.left_s)
+        mask, start = torch.from_numpy(self.mask[returns.tick]), self.start_from(returns.tick)
+        value = best_value(
+            self.q(self.online, after) - start, self.q(self.target, after) - start, mask
+        )
+        then = value * torch.from_numpy(returns.discount.astype(np.float32))
+        return torch.from_numpy(returns.reward.astype(np.float32)) + then
 
     def update(self) -> dict[str, float]:
         """One gradient step."""
@@ -259,16 +281,12 @@ class KnotLearner:
             self.online, self.inputs(tick, s.soc[tick] - target, left * np.float64(self.dt_s))
         )
         loss = torch.zeros(())
-        if c.td_weight > 0.0:
-            returns = n_step_returns(self.cost, c, self.unit_kg, self.dt_s, tick, target, left)
-            with torch.no_grad():
-                after = self.inputs(returns.tick, returns.error, returns.left_s)
-                mask = torch.from_numpy(self.mask[returns.tick])
-                value = best_value(self.q(self.online, after), self.q(self.target, after), mask)
-            aim = torch.from_numpy(returns.reward.astype(np.float32)) + value * torch.from_numpy(
-                returns.discount.astype(np.float32)
-            )
-            taken = q.gather(1, action[:, None])[:, 0]
+        if c.td_weight > 0.0 and demos < c.batch:
+            # Demonstrations stay out of it: every one of them lands where it should, so values
+            # learned from them would hold landing for free.
+            rest = slice(demos, None)
+            aim = self.aims(tick[rest], target[rest], left[rest])
+            taken = q[rest].gather(1, action[rest, None])[:, 0]
             loss = loss + c.td_weight * torch.nn.functional.huber_loss(taken, aim)
         loss = loss + self._restraint(q, tick, action, demos)
         self.adam.param_groups[0]["lr"] = learning_rate(c, self.step)

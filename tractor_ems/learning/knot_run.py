@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tractor_ems.learning.knot_learner import KnotLearner
-from tractor_ems.learning.knot_samples import KnotSamples, knot_samples
+from tractor_ems.learning.knot_samples import KnotSamples, knot_samples, measured_of
 from tractor_ems.learning.recorded import drive_of_trace
 from tractor_ems.learning.samples import observation_spec
 from tractor_ems.policies.envelope import envelope_of
@@ -86,7 +86,8 @@ class KnotRun:
             net=self.learner.network(),
             scaling=self.scaling,
             horizon_s=own.horizon_s,
-            temperature=own.temperature,
+            measured=measured_of(self.samples, params, experiment.reward, own.knots),
+            start_units=self.learner.start_units,
             metadata={**metadata, "envelope": envelope},
         )
         save_knot_q(out, policy)

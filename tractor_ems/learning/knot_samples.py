@@ -8,11 +8,13 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from tractor_ems.learning.recorded import Drive
+from tractor_ems.learning.rewards import RewardConfig, battery_price
 from tractor_ems.learning.samples import servable_demand_w
 from tractor_ems.policies.genset import power_max_w
-from tractor_ems.policies.knot_q import OFF, feasible
+from tractor_ems.policies.knot_q import OFF, Measured, feasible, knots_of
 from tractor_ems.policies.mlp import Float32Array
 from tractor_ems.policies.q_policy import Normalisation, demand_inputs
+from tractor_msgs_py.errors import ConfigError
 from tractor_msgs_py.observation import Observation, ObservationSpec, init_filters, update_filters
 from tractor_msgs_py.trajectory import BoolArray, FloatArray, IntArray
 from tractor_sim.powertrain import PlantState, PowertrainParams, power_limits
@@ -24,12 +26,12 @@ class KnotSamples:
 
     Attributes:
         demand: demand and filters as network inputs, shape (N, D).
-        engine_on, engine_share: state before the decision.
+        engine_on: state before the decision.
         soc, soc_next: observed before and after the step.
         soc_target: of the run.
         action: output that the applied power stands for.
         cost_kg: fuel burnt, start fuel included.
-        power_demand_w: demand at the bus [W].
+        battery_w, power_demand_w: applied battery power and demand at the bus [W].
         off, first, last: feasible actions, see ``knot_q.Feasible``.
         after: ticks to the end of the recording, this one included.
         planned: whether the recording ends where the run was planned to end.
@@ -38,12 +40,12 @@ class KnotSamples:
 
     demand: Float32Array
     engine_on: BoolArray
-    engine_share: FloatArray
     soc: FloatArray
     soc_next: FloatArray
     soc_target: FloatArray
     action: IntArray
     cost_kg: FloatArray
+    battery_w: FloatArray
     power_demand_w: FloatArray
     off: BoolArray
     first: IntArray
@@ -142,12 +144,12 @@ def _of_drive(
     return KnotSamples(
         demand=demand_inputs(scaling, demand_w, features_w),
         engine_on=on[:-1],
-        engine_share=before_w / top_w,
         soc=drive.soc[:-1],
         soc_next=drive.soc[1:],
         soc_target=target,
         action=np.where(on[1:], 1 + np.clip(knot, 0, knots - 1), OFF),
         cost_kg=drive.fuel_kg,
+        battery_w=drive.battery_power_w,
         power_demand_w=demand_w,
         off=allowed.off,
         first=allowed.first,
@@ -158,26 +160,67 @@ def _of_drive(
     )
 
 
+def measured_of(
+    samples: KnotSamples, params: PowertrainParams, reward: RewardConfig, knots: int
+) -> Measured:
+    """Fuel over engine power, and SOC over battery power, fitted to the recorded steps.
+
+    Raises:
+        ConfigError: the engine never ran.
+    """
+    going = (samples.action != OFF) & samples.engine_on
+    if not going.any():
+        raise ConfigError("targets sampled: the engine never ran in the recordings")
+    points_w = knots_of(params, knots)
+    engine_w = samples.power_demand_w - samples.battery_w
+    served = going & (engine_w >= 0.0) & (engine_w <= points_w[-1])
+    fuel_kg = knot_values(engine_w, samples.cost_kg, points_w, served)
+    near = np.bincount(samples.action[served] - 1, minlength=knots)
+    fuel_kg = np.where(near >= LEAST_SEEN, fuel_kg, UNSEEN_KG)
+    x, level = samples.battery_w / 1e5, samples.soc - 0.5
+    columns = np.stack((x, x * x, x * level), axis=1)
+    fit = np.linalg.lstsq(columns, samples.soc_next - samples.soc, rcond=None)[0]
+    up, down = np.array([0.005]), np.array([-0.005])
+    price = float(battery_price(reward, params, up, down, np.zeros(1))[0]) / 0.01
+    return Measured(
+        tuple(fuel_kg.tolist()), (float(fit[0]), float(fit[1]), float(fit[2])), price,
+        reward.cost_unit,
+    )  # fmt: skip
+
+
+LEAST_SEEN, UNSEEN_KG = 20, 1.0
+"""A knot run in fewer steps than this is not chosen: its fuel is this."""
+
+
 def running_baseline_kg(
     power_demand_w: FloatArray, cost_kg: FloatArray, points_w: FloatArray, counted: BoolArray
 ) -> FloatArray:
     """Mean cost of steps as a piecewise linear function of demand, at every step (N,) [kg].
 
-    A least-squares fit of the measured costs of the ``counted`` steps. It depends on demand only,
-    so subtracting it changes no choice and takes away most of the noise of a return.
+    A fit to the measured costs of the ``counted`` steps. It depends on demand only, so
+    subtracting it changes no choice and takes away most of the noise of a return.
     """
-    place = np.clip(np.interp(power_demand_w, points_w, np.arange(len(points_w))), 0, None)
-    low = np.minimum(place.astype(np.int64), len(points_w) - 2)
-    share = place - low
-    size = len(points_w)
-    gram, moment = 1e-3 * np.eye(size), np.zeros(size)
-    a, b, y = low[counted], share[counted], cost_kg[counted]
+    fitted: FloatArray = np.interp(
+        power_demand_w, points_w, knot_values(power_demand_w, cost_kg, points_w, counted)
+    )
+    return fitted
+
+
+def knot_values(
+    x: FloatArray, y: FloatArray, points: FloatArray, counted: BoolArray
+) -> FloatArray:
+    """Values at evenly spaced ``points`` of the piecewise linear function that fits y(x) best."""
+    place = np.interp(x[counted], points, np.arange(len(points)))
+    a = np.minimum(place.astype(np.int64), len(points) - 2)
+    b, size = place - a, len(points)
+    gram, moment = np.zeros((size, size)), np.zeros(size)
     np.add.at(gram, (a, a), (1 - b) ** 2)
     np.add.at(gram, (a + 1, a + 1), b**2)
     np.add.at(gram, (a, a + 1), b * (1 - b))
     np.add.at(gram, (a + 1, a), b * (1 - b))
-    np.add.at(moment, a, (1 - b) * y)
-    np.add.at(moment, a + 1, b * y)
-    value = np.linalg.solve(gram, moment)
-    fitted: FloatArray = (1 - share) * value[low] + share * value[low + 1]
-    return fitted
+    np.add.at(moment, a, (1 - b) * y[counted])
+    np.add.at(moment, a + 1, b * y[counted])
+    # A little stiffness bridges points that nothing is near.
+    bend = np.diff(np.eye(size), n=2, axis=0)
+    found = np.linalg.lstsq(gram + 1e-3 * bend.T @ bend, moment, rcond=None)[0]
+    return np.asarray(found, dtype=np.float64)

@@ -20,7 +20,8 @@ class KnotsConfig:
         updates: gradient steps.
         batch: transitions per step.
         demo_share: of the batch that is drawn from DP's runs, with the target and the end that
-            they had; the rest from all runs.
+            they had; the rest from all runs. The temporal
+            difference is taken over the rest alone.
         hindsight: share of those that get, instead, the SOC and the time of a later tick of
             their run as target and end: a piece of an optimal run is optimal for where it led.
         relabel: give the rest other targets and planned ends than they had. Demand, fuel and the
@@ -32,7 +33,7 @@ class KnotsConfig:
         td_weight: of the temporal difference; 0 leaves imitation alone.
         conservative: weight of log-sum-exp(Q) over the feasible actions less Q of DP's action.
         conservative_rest: the same over the relabelled rest, whoever drove.
-        temperature: of that log-sum-exp and of the running power, > 0 [reward units].
+        temperature: of that log-sum-exp, > 0 [reward units].
         margin: an action at distance d (share of the outputs) must be worth ``margin * d`` less
             than DP's, off being at distance 1 from all knots [reward units].
         dueling: learn one value for the state and an advantage per action.
@@ -45,21 +46,21 @@ class KnotsConfig:
     """
 
     knots: Annotated[int, Field(ge=2, le=512)] = 33
-    updates: Count = 20_000
+    updates: Count = 6000
     batch: Count = 256
-    demo_share: Share = 0.5
+    demo_share: Share = 0.3
     hindsight: Share = 0.7
     relabel: bool = True
-    n_step: Annotated[int, Field(ge=1, le=600)] = 12
+    n_step: Annotated[int, Field(ge=1, le=600)] = 20
     learning_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 2e-3
     hold_fraction: Share = 0.5
     final_fraction: Share = 0.02
     gamma: Share = 1.0
-    target_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.01
+    target_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 0.03
     td_weight: Weight = 1.0
-    conservative: Weight = 1.0
+    conservative: Weight = 0.3
     conservative_rest: Weight = 0.0
-    temperature: Annotated[float, Field(gt=0.0, le=1e3)] = 0.1
+    temperature: Annotated[float, Field(gt=0.0, le=1e3)] = 0.3
     margin: Weight = 0.0
     dueling: bool = True
     hidden: Annotated[

@@ -1,10 +1,11 @@
 """The sampled policy over knots of engine power as a file of kind ``ddqn_sampled_knots``."""
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from tractor_ems.policies.knot_q import KnotQ
+from tractor_ems.policies.knot_q import KnotQ, Measured
 from tractor_ems.policies.mlp import Float32Array, Mlp
 from tractor_ems.policies.policy_file import params_of, write_policy_file
 from tractor_ems.policies.q_policy import LAYERS_MAX, Normalisation
@@ -36,7 +37,8 @@ def save_knot_q(path: Path, policy: KnotQ) -> None:
         "normalisation": asdict(policy.scaling),
         "network": {"layers": len(policy.net.weights), "activation": policy.net.activation},
         "horizon_s": policy.horizon_s,
-        "temperature": policy.temperature,
+        "measured": asdict(policy.measured),
+        "start_units": policy.start_units,
     }
     write_policy_file(path, tensors, metadata)
 
@@ -72,7 +74,8 @@ def knot_q_from(tensors: dict[str, Float32Array], data: dict[str, Any]) -> KnotQ
         net=Mlp(weights, biases, activation),
         scaling=Normalisation(**data["normalisation"]),
         horizon_s=float(data["horizon_s"]),
-        temperature=float(data["temperature"]),
+        measured=_measured(data["measured"]),
+        start_units=float(data["start_units"]),
         metadata=data,
     )
     if policy.spec.dt_s != policy.params.dt_s:
@@ -80,3 +83,12 @@ def knot_q_from(tensors: dict[str, Float32Array], data: dict[str, Any]) -> KnotQ
             f"observation dt_s {policy.spec.dt_s}, the powertrain's is {policy.params.dt_s}"
         )
     return policy
+
+
+def _measured(data: dict[str, Any]) -> Measured:
+    fuel_kg = tuple(float(value) for value in data["fuel_kg"])
+    first, second, third = (float(value) for value in data["soc_fit"])
+    price_kg, unit_kg = float(data["price_kg"]), float(data["unit_kg"])
+    if not all(math.isfinite(v) for v in (*fuel_kg, first, second, third, price_kg, unit_kg)):
+        raise PolicyError("measured: a value is not finite")
+    return Measured(fuel_kg, (first, second, third), price_kg, unit_kg)
