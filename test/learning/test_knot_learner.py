@@ -173,7 +173,7 @@ def tiny_samples(count: int = 400) -> KnotSamples:
 
 
 TINY = KnotsConfig(
-    knots=2, updates=450, batch=64, demo_share=0.0, conservative=0.0, n_step=1, hidden=(32,),
+    knots=2, updates=600, batch=128, demo_share=0.0, conservative=0.0, n_step=1, hidden=(32,),
     horizon_s=3.0, soc_width=0.2, wall_kg=0.0, end_kg_per_soc2=16.0, learning_rate=1e-2,
     target_rate=0.1,
 )  # fmt: skip
