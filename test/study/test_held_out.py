@@ -2,17 +2,24 @@
 
 import os
 
+import numpy as np
 import pytest
 import yaml
 
+from tractor_ems.policies.mlp import Mlp
+from tractor_ems.policies.q_policy import Normalisation, demand_inputs
+from tractor_ems.policies.run_or_stand import RunOrStand, prices_of
 from tractor_ems.study import pieces
 from tractor_ems.study.held_out import run_held_out
 from tractor_ems.study.held_out_config import load_held_out
+from tractor_ems.study.held_out_policies import refitted
 from tractor_ems.study.held_out_record import scenario_of
 from tractor_ems.study.held_out_report import write_report
 from tractor_ems.study.held_out_results import read_results, results_of
 from tractor_ems.study.held_out_score import scored
-from tractor_msgs_py.errors import ConfigError, RunAborted
+from tractor_msgs_py.errors import ConfigError, PolicyError, RunAborted
+from tractor_msgs_py.observation import DemandFilter, ObservationSpec
+from tractor_sim.config import load_powertrain
 from tractor_sim.duty_cycle.library import cycle_names
 from tractor_sim.resources import resource_path
 
@@ -109,6 +116,34 @@ def test_comments_change_no_digest_of_code_and_code_does(tmp_path, monkeypatch):
     assert digest('"""Doc."""\ndef f():\n    """Doc."""\n    return 1  # why\n') == plain
     assert digest("def f():\n    return 2\n") != plain
     pieces.code_digest.cache_clear()
+
+
+def run_or_stand(params, spec, scaling):
+    """A policy whose network says nothing, of however many inputs it has to have."""
+    for inputs in range(3, 20):
+        net = Mlp((np.zeros((2, inputs), np.float32),), (np.zeros(2, np.float32),), "tanh")
+        try:
+            return RunOrStand(params, spec, (net,), scaling, prices_of(params, 1.0, 0.0))
+        except PolicyError:
+            continue
+    raise AssertionError("no number of inputs fits")
+
+
+def test_a_refitted_policy_sees_the_same_in_units_of_the_new_vehicle():
+    field, small = load_powertrain("field"), load_powertrain("utility_150kw")
+    share = small.engine.power_max_w / field.engine.power_max_w
+    scaling = Normalisation(60e3, 50e3)
+    spec = ObservationSpec(dt_s=1.0, filters=(DemandFilter("running_mean", 120.0, 60e3),))
+    made = refitted(run_or_stand(field, spec, scaling), small)
+    demand_w, slow_w = np.array([90e3]), np.array([[70e3]])
+    np.testing.assert_allclose(
+        demand_inputs(made.scaling, share * demand_w, share * slow_w),
+        demand_inputs(scaling, demand_w, slow_w),
+        rtol=1e-5,
+    )
+    assert made.spec.filters[0].prior_w == pytest.approx(share * 60e3)
+    assert made.prices.soc_kg == pytest.approx(prices_of(small, 1.0, 0.0).soc_kg)
+    assert made.params == small and made.prices.start_kg == small.engine.start_fuel_kg
 
 
 @pytest.mark.slow

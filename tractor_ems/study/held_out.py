@@ -141,7 +141,9 @@ def _drivers(config: HeldOutConfig, trained: Sequence[Trained]) -> list[Driver]:
         Driver(item.training.name, item.training.seed, item.training.out, item.file_sha256)
         for item in trained
     ]
-    return made + [Driver(name) for name in config.settings.rules]
+    rules = [Driver(name) for name in config.settings.rules]
+    # The optimum solves every cycle, which takes longest: it goes first.
+    return sorted([*made, *rules], key=lambda driver: driver.name != DP)
 
 
 def _drives(config: HeldOutConfig, drivers: Sequence[Driver], out: Path) -> list[Driving]:

@@ -303,7 +303,8 @@ def _transfer(results: Results) -> str:
         f"Demand is scaled with the engine's rated power ({factors}): the originals ask for more "
         "than these vehicles have. *As it is*: the policy still believes to drive its own "
         "vehicle; only the published limits are the new one's. *Right plant model*: its engine, "
-        "battery and limits are the new vehicle's, what it learnt is not. *Trained anew*: from "
+        "battery, limits and prices are the new vehicle's, demand is seen in units of its power; "
+        "what it learnt stays. *Trained anew*: from "
         "bags of the new vehicle. Rules have their plain settings there. References are solved "
         "to each run's own end on one grid, without the halving certificate.\n\n"
         + table(heads, rows)

@@ -136,7 +136,7 @@ def train(task: Training) -> Trained:
         recordings, read_s, read_cpu_s = _recordings(task.bags, task.bags_key, task.powertrain)
         began, began_cpu = time.perf_counter(), time.process_time()
         if task.kind == "learner":
-            for left in task.out.parent.glob(f"{task.out.stem}*"):
+            for left in task.out.parent.glob(f"{task.out.stem}.*"):
                 left.unlink()  # a checkpoint or log of another key
             report = train_on(
                 train_config(task),
