@@ -87,9 +87,11 @@ def baselines(
     """Search the settings of every baseline on dev cycles with one objective.
 
     Writes OUT/POLICY.jsonl (everything tried), OUT/POWERTRAIN.yaml (what was chosen, for
-    config/baseline) and OUT/baselines.md.
+    config/baseline) and OUT/baselines.md. With --policy, what an earlier search left in OUT
+    about the others stays.
     """
     import dataclasses
+    from json import loads
 
     from tractor_ems.evaluate_set import cores
     from tractor_ems.tuning.chosen_report import chosen_json, page, settings_yaml
@@ -102,6 +104,7 @@ def baselines(
     params = load_powertrain(powertrain)
     whole = load_grid(params, grid)
     chosen_preset = whole.preset(preset)
+    order = tuple(chosen_preset.policies)
     for name in policy or ():
         if name not in chosen_preset.policies:
             known = ", ".join(chosen_preset.policies)
@@ -113,11 +116,15 @@ def baselines(
         found = search(
             params, whole, chosen_preset, out, workers=workers or cores(), progress=progress
         )
+    document = chosen_json(whole, found)
+    if policy and (out / "chosen.json").is_file():
+        earlier = loads((out / "chosen.json").read_text())
+        document = {n: {**earlier, **document}[n] for n in order if n in {**earlier, **document}}
     label = params.name.partition(":")[0]
     command = f"ems tune baselines --powertrain {powertrain} --preset {preset} --out DIR"
-    write_bytes(out / f"{label}.yaml", settings_yaml(params, found).encode())
-    write_bytes(out / "baselines.md", page(params, whole, chosen_preset, found, command).encode())
-    document = chosen_json(whole, found)
+    text = page(params, whole, chosen_preset, document, command)
+    write_bytes(out / f"{label}.yaml", settings_yaml(params, document).encode())
+    write_bytes(out / "baselines.md", text.encode())
     write_json(out / "chosen.json", document)
     if json:
         print_json(document)

@@ -6,7 +6,7 @@ from typing import Any
 import yaml
 
 from tractor_ems.tuning.grid import Grid, Preset
-from tractor_ems.tuning.grid_search import Chosen, Trial, excess
+from tractor_ems.tuning.grid_search import Chosen, excess
 from tractor_msgs_py import __version__
 from tractor_sim.powertrain import PowertrainParams
 from tractor_sim.powertrain_json import powertrain_hash
@@ -57,19 +57,8 @@ shorter strokes than any recording. It decided nothing.
 """
 
 
-def settings_yaml(params: PowertrainParams, chosen: Mapping[str, Chosen]) -> str:
-    """The file ``config/baseline/NAME.yaml``."""
-    document = {
-        "powertrain": params.name,
-        "powertrain_hash": powertrain_hash(params),
-        "policies": {name: dict(found.dev.settings) for name, found in chosen.items()},
-    }
-    head = "# Settings of the baselines, chosen by `ems tune baselines`; see docs/baselines.md.\n"
-    return head + yaml.safe_dump(document, sort_keys=False)
-
-
 def chosen_json(grid: Grid, chosen: Mapping[str, Chosen]) -> dict[str, Any]:
-    """The same as plain data, with the scores."""
+    """Settings and scores by policy as plain data, of which the rest here is made."""
     return {
         name: {
             "settings": found.dev.settings,
@@ -78,26 +67,34 @@ def chosen_json(grid: Grid, chosen: Mapping[str, Chosen]) -> dict[str, Any]:
             "tried": found.tried,
             "dev": found.dev.summary(),
             "squeezed": found.squeezed.summary(),
+            "squeezed_holds_bars": excess(found.squeezed, grid) == (0, 0.0),
         }
         for name, found in chosen.items()
     }
+
+
+def settings_yaml(params: PowertrainParams, chosen: Mapping[str, Any]) -> str:
+    """The file ``config/baseline/NAME.yaml``."""
+    document = {
+        "powertrain": params.name,
+        "powertrain_hash": powertrain_hash(params),
+        "policies": {name: dict(row["settings"]) for name, row in chosen.items()},
+    }
+    head = "# Settings of the baselines, chosen by `ems tune baselines`; see docs/baselines.md.\n"
+    return head + yaml.safe_dump(document, sort_keys=False)
 
 
 def page(
     params: PowertrainParams,
     grid: Grid,
     preset: Preset,
-    chosen: Mapping[str, Chosen],
+    chosen: Mapping[str, Any],
     command: str,
 ) -> str:
     """Markdown."""
-    sets = {
-        "dev": {name: found.dev for name, found in chosen.items()},
-        "squeezed": {name: found.squeezed for name, found in chosen.items()},
-    }
     rows = [
-        f"| {name} | {_settings(found.dev.settings)} | {found.feasible} of {found.tried} |"
-        for name, found in chosen.items()
+        f"| {name} | {_settings(row['settings'])} | {row['feasible']} of {row['tried']} |"
+        for name, row in chosen.items()
     ]
     return _PAGE.format(
         command=command,
@@ -108,27 +105,27 @@ def page(
         name=params.name,
         hash=powertrain_hash(params)[:12],
         version=__version__,
-        dev=_table(sets["dev"], grid),
-        squeezed=_table(sets["squeezed"], grid),
+        dev=_table(chosen, "dev", "holds_bars"),
+        squeezed=_table(chosen, "squeezed", "squeezed_holds_bars"),
         settings="\n".join(["| policy | settings | hold the bars |", "|---|---|---|", *rows]),
     )
 
 
-def _table(trials: Mapping[str, Trial], grid: Grid) -> str:
+def _table(chosen: Mapping[str, Any], which: str, bars: str) -> str:
     lines = [
         "| policy | median | mean | worst | starts | SOC error mean | max | unmet | bars |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
-    for name, trial in trials.items():
-        row = trial.summary()
+    for name, found in chosen.items():
+        row = found[which]
         scores = " | ".join(f"{row[key]:.4f}" for key in ("median", "mean", "worst"))
-        held = "held" if excess(trial, grid) == (0, 0.0) else "missed"
         lines.append(
             f"| {name} | {scores} | {row['starts']} | {100 * row['soc_mean']:.1f} | "
-            f"{100 * row['soc_max']:.1f} | {row['short']} | {held} |"
+            f"{100 * row['soc_max']:.1f} | {row['short']} | "
+            f"{'held' if found[bars] else 'missed'} |"
         )
     return "\n".join(lines)
 
 
 def _settings(settings: Mapping[str, Any]) -> str:
-    return ", ".join(f"{key} {value:g}" for key, value in settings.items())
+    return ", ".join(f"{key} {value}" for key, value in settings.items())
