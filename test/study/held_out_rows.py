@@ -92,8 +92,6 @@ def found_rows(**scores: float) -> dict[str, Any]:
                 "policy": policy,
                 "seed": None if policy == "never_stop_ecms" else 0,
                 "cycle": f"light_{n}",
-                "operation": "light",
-                "fuel_kg": 3.0,
                 "soc_final": 0.55,
                 "shortfall_j": 0.0,
                 "engine_starts": 1,

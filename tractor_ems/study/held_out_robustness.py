@@ -114,8 +114,10 @@ def optima_of(
 def scored_rows(
     rows: Sequence[dict[str, Any]], served: Sequence[Sequence[int]], fuel_kg: Sequence[list[float]]
 ) -> list[dict[str, Any]]:
-    """The rows with their scores; None where there was shortfall."""
-    made = [{**row, "dp_ratio": None} for row in rows]
+    """The rows with their scores in place of their fuel; None where there was shortfall."""
+    made: list[dict[str, Any]] = [{**row, "dp_ratio": None} for row in rows]
+    for row in made:
+        del row["fuel_kg"], row["operation"]
     for numbers, least in zip(served, fuel_kg, strict=True):
         for number, ratio in zip(numbers, ratios([rows[n] for n in numbers], least), strict=True):
             made[number]["dp_ratio"] = ratio
