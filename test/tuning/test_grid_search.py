@@ -1,6 +1,7 @@
 """The search: what may be searched, what counts as best, and that it says so in its log."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,13 +9,14 @@ import pytest
 from tractor_ems.cli import main
 from tractor_ems.policies import baselines
 from tractor_ems.tuning import grid_search
-from tractor_ems.tuning.chosen_report import page, settings_yaml
+from tractor_ems.tuning.chosen_report import chosen_json, page, settings_yaml
 from tractor_ems.tuning.closed_loop import FUEL, SHORTFALL, SOC_FINAL, STARTS
 from tractor_ems.tuning.grid import combinations, load_grid
 from tractor_ems.tuning.grid_search import search
 from tractor_msgs_py.errors import ConfigError, CycleError
 from tractor_sim.config import load_powertrain
 
+ROOT = Path(__file__).resolve().parents[2]
 FIELD = load_powertrain("field")
 TINY = """
 dev: {operations: [], seeds: [1, 1], others: [planter_1001, planter_1002]}
@@ -140,15 +142,34 @@ def test_what_is_chosen_is_what_policies_read(grid_of, driven, tmp_path):
     grid = grid_of()
     found = search(FIELD, grid, grid.preset("full"), tmp_path)
     path = tmp_path / "field.yaml"
-    path.write_text(settings_yaml(FIELD, found))
+    path.write_text(settings_yaml(FIELD, chosen_json(grid, found)))
     assert baselines.read_tuned(path)["a_ecms"] == found["a_ecms"].dev.settings
-    text = page(FIELD, grid, grid.preset("full"), found, "ems tune baselines")
+    text = page(FIELD, grid, grid.preset("full"), chosen_json(grid, found), "ems tune baselines")
     assert "| a_ecms | 0.9091 | 0.9091 | 0.9091 | 4 | 0.0 | 0.0 | 0 | held |" in text
 
 
 def test_a_policy_outside_the_preset_is_refused(capsys, tmp_path):
     code = main(["tune", "baselines", "--policy", "dp", "--out", str(tmp_path)])
     assert code == 2 and "--policy: 'dp'" in capsys.readouterr().err
+
+
+def test_what_ships_for_field_is_the_best_of_the_committed_log():
+    path = baselines.tuned_path(FIELD)
+    assert path is not None
+    grid = load_grid(FIELD)
+    for name, settings in baselines.read_tuned(path).items():
+        log = ROOT / "docs" / "data" / "tuning" / f"{name}.jsonl"
+        head, *lines = (json.loads(line) for line in log.read_text().splitlines())
+        assert head["cycles"] == list(grid.dev.names)
+
+        def rank(line):
+            beyond = max(line["soc_mean"] - grid.soc_mean, 0.0)
+            beyond += max(line["soc_max"] - grid.soc_max, 0.0)
+            return line["short"], round(beyond, 4), -line.get("median", 0.0)
+
+        best = min(rank(line) for line in lines)
+        (chosen,) = (line for line in lines if line["settings"] == settings)
+        assert rank(chosen) == pytest.approx(best, abs=2e-4), name
 
 
 @pytest.mark.slow
