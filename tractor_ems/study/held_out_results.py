@@ -26,7 +26,11 @@ def results_of(found: Mapping[str, Any]) -> dict[str, Any]:
     rounded = {name: _rounded(found[name]) for name in _TABLES}
     results = {
         **analyse(rounded["rows"], settings["opponents"], settings["budget"]["resamples"]),
-        "robustness": robustness_table(rounded["robustness_rows"], settings["never_stop"]),
+        "robustness": robustness_table(
+            rounded["robustness_rows"],
+            settings["never_stop"],
+            [item["name"] for item in settings["disturbances"]],
+        ),
         "transfer": transfer_table(rounded["transfer_rows"]),
         **{name: found[name] for name in _AS_FOUND},
         **rounded,

@@ -202,13 +202,16 @@ def analyse(rows: Rows, opponents: Sequence[str], resamples: int, seed: int = 0)
     return {"policies": policies, "per_operation": per_operation, "pairwise": pairwise}
 
 
-def robustness_table(rows: Rows, never_stop: str) -> dict[str, Any]:
+def robustness_table(rows: Rows, never_stop: str, order: Sequence[str] = ()) -> dict[str, Any]:
     """By policy and disturbance: mean score, loss against the undisturbed score on the same cycle
     over runs that finished in both, failed runs, violations, and whether that is no worse than
-    ``never_stop``'s: neither more loss nor a larger share of failed runs."""
+    ``never_stop``'s: neither more loss nor a larger share of failed runs. Disturbances come in
+    the given order."""
     by_run = {(r["disturbance"], r["policy"], r["seed"], r["cycle"]): r for r in rows}
     names = dict.fromkeys(row["policy"] for row in rows)
+    place = {name: number for number, name in enumerate(order)}
     listed = [d for d in dict.fromkeys(row["disturbance"] for row in rows) if d != "none"]
+    listed.sort(key=lambda name: place.get(name, len(place)))
     found: dict[str, Any] = {name: {} for name in names}
     for name in names:
         for disturbance in listed:

@@ -231,7 +231,11 @@ def _robustness(results: Results) -> Figure:
             cell = table[name][disturbance]
             text = "-" if cell["loss"] is None else f"{100 * cell['loss']:.2f}"
             mark = f"\n{cell['failed']} failed" if cell["failed"] else ""
-            axes.text(column, row, text + mark, ha="center", va="center", fontsize=7)
+            dark = cell["loss"] is not None and abs(cell["loss"]) > 0.015
+            axes.text(
+                column, row, text + mark, ha="center", va="center", fontsize=7,
+                color="white" if dark else BLACK,
+            )  # fmt: skip
     axes.set_xticks(range(len(listed)), listed, rotation=40, ha="right")
     axes.set_yticks(range(len(names)), names)
     figure.colorbar(image, ax=axes, label="loss, points of dp_ratio", shrink=0.8)
