@@ -43,7 +43,9 @@ FIELD = load_powertrain("field")
 BATTERY_W = FIELD.battery.power_max_w
 SPEC = ObservationSpec(dt_s=1.0, filters=(DemandFilter("low_pass", 8.0),))
 SCALING = Normalisation(80e3, 50e3, soc_scale=0.1)
-SMALL = RunOrStandConfig(updates=40, batch=16, errors=2, commit_s=6.0, hidden=(16, 16))
+SMALL = RunOrStandConfig(
+    updates=40, batch=16, errors=2, commit_s=6.0, soc_scale=0.1, hidden=(16, 16)
+)
 UNPLANNED = replace(SMALL, planned=False, holding_kg_per_s=0.008, gamma=0.998)
 PLANS = pytest.mark.parametrize("config", [SMALL, UNPLANNED], ids=["planned", "unplanned"])
 
@@ -205,7 +207,7 @@ def test_a_file_gives_the_policy_back_and_refuses_what_does_not_fit(tmp_path):
         assert again.nets[0].weights[0].tobytes() == policy.nets[0].weights[0].tobytes()
         save_run_or_stand(tmp_path / "q.safetensors", replace(again, metadata={}))
         assert (tmp_path / "q.safetensors").read_bytes() == path.read_bytes()
-    with pytest.raises(PolicyError, match="network maps 5 inputs to 2 outputs"):
+    with pytest.raises(PolicyError, match="network maps 6 inputs to 2 outputs"):
         replace(policy, horizon_s=2400.0)
 
 
@@ -235,6 +237,7 @@ TRAINING = load_train_config(
         "powertrain": "paper",
         "updates": 24,
         "run_or_stand.batch": 8,
+        "run_or_stand.table_updates": 0,
         "run_or_stand.hidden": [8, 8],
         "checkpoint_every": 10,
     },

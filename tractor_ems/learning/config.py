@@ -148,8 +148,9 @@ class RunOrStandConfig:
         price: of a unit of SOC, times the marginal fuel of a running engine.
         soc_scale: of the SOC error as an input; soc_width: half width of the errors drawn, less
             where ``soc_per_s`` would not lead back in time.
-        gain_weight, level_weight: weights of G's squared error and of V's mean error per tick,
-            against V's error about that mean.
+        gain_weight: weight of G's squared error against that of V about its mean per tick.
+        margin_kg: added to what standing saves when the policy is made: near the top of the window
+            a price that is a little too low stops the charging, and the engine would idle on.
         short_kg_per_j: price of demand left unmet.
         double: choose with the online net, evaluate with the averaged one.
         hidden: of the network, tanh.
@@ -160,13 +161,13 @@ class RunOrStandConfig:
     """
 
     planned: bool = True
-    updates: Count = 10_000
+    updates: Count = 4_000
     batch: Count = 128
     errors: Annotated[int, Field(ge=2, le=64)] = 4
     learning_rate: Rate = 2e-3
     hold_fraction: Fraction = 0.4
     final_fraction: Fraction = 0.01
-    target_rate: Rate = 0.04
+    target_rate: Rate = 0.01
     gamma: Annotated[float, Field(ge=0.0, le=1.0)] = 1.0
     commit_s: Seconds = 12.0
     horizon_s: Seconds = 2400.0
@@ -174,15 +175,15 @@ class RunOrStandConfig:
     near_end_s: Seconds = 400.0
     end_kg: Annotated[float, Field(ge=0.0, le=1e6)] = 30.0
     holding_kg_per_s: NotNegative = 0.0
-    wall_kg_per_s: NotNegative = 2e-3
-    wall_at: Positive = 0.23
-    most_kg_per_s: NotNegative = 0.02
+    wall_kg_per_s: NotNegative = 6e-4
+    wall_at: Positive = 0.22
+    most_kg_per_s: NotNegative = 1.2e-3
     price: Positive = 1.02
-    soc_scale: Positive = 0.1
-    soc_width: Positive = 0.26
+    soc_scale: Positive = 0.05
+    soc_width: Positive = 0.24
     soc_per_s: Positive = 4e-4
-    gain_weight: NotNegative = 4.0
-    level_weight: NotNegative = 0.0
+    gain_weight: NotNegative = 8.0
+    margin_kg: NotNegative = 0.002
     short_kg_per_j: NotNegative = 2e-6
     double: bool = True
     hidden: tuple[Width, Width] = (64, 64)

@@ -42,12 +42,15 @@ from tractor_ems.learning.stretches import baseline, reserve, stretches
 from tractor_ems.optimal.one_step_kernel import Cell
 from tractor_ems.policies.genset import power_max_w, running_fuel_kg_per_s
 from tractor_ems.policies.mlp import Float32Array, Mlp
+from tractor_ems.policies.q_policy import Normalisation
 from tractor_ems.policies.reserve import starts_slowly
 from tractor_ems.policies.run_or_stand import (
     SLOPE_STEP,
+    SOC_INPUTS,
     Prices,
     prices_of,
     reserve_inputs,
+    soc_inputs,
     stiffness_kg,
     time_inputs,
 )
@@ -172,7 +175,8 @@ class RunOrStandLearner:
     ) -> None:
         self.problem, self.config, self.rng = problem, config, sample_rng
         extra = time_inputs(np.zeros(1), config.horizon_s).shape[1] if config.planned else 0
-        sizes = (problem.inputs.shape[1] + extra + 1, *config.hidden, 2)
+        self.scaling = Normalisation(0.0, 1.0, config.soc_scale)
+        sizes = (problem.inputs.shape[1] + extra + SOC_INPUTS, *config.hidden, 2)
         self.online, self.target = Net(sizes, "tanh", init_rng), Net(sizes, "tanh", init_rng)
         copy_towards(self.target, self.online, 1.0)
         self.adam = torch.optim.Adam(self.online.parameters(), lr=config.learning_rate, fused=True)
@@ -188,8 +192,8 @@ class RunOrStandLearner:
         known = [p.inputs[tick]]
         if p.horizon:
             known.append(time_inputs(p.dt_s * left.astype(np.float64), self.config.horizon_s))
-        column = (error.reshape(-1, 1) / self.config.soc_scale).astype(np.float32)
-        return np.concatenate((np.repeat(np.concatenate(known, 1), k, axis=0), column), axis=1)
+        columns = soc_inputs(self.scaling, error.ravel())
+        return np.concatenate((np.repeat(np.concatenate(known, 1), k, axis=0), columns), axis=1)
 
     @torch.no_grad()
     def values(
@@ -283,8 +287,6 @@ class RunOrStandLearner:
         miss_g = miss_g * torch.from_numpy(~self.problem.must_start[tick, None])
         common = miss_v.mean(dim=1, keepdim=True)
         loss = ((miss_v - common) ** 2).mean() + c.gain_weight * (miss_g**2).mean()
-        if c.level_weight:
-            loss = loss + c.level_weight * (common**2).mean()
         self.adam.param_groups[0]["lr"] = learning_rate(c, self.step)
         self.adam.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
@@ -298,8 +300,10 @@ class RunOrStandLearner:
         }
 
     def network(self) -> Mlp:
-        """The averaged network, for a policy."""
-        return to_numpy(self.target)
+        """The averaged network, for a policy, its G raised by the margin."""
+        net = to_numpy(self.target)
+        net.biases[-1][1] += np.float32(self.config.margin_kg / self.problem.prices.unit_kg)
+        return net
 
     def tensors(self) -> dict[str, Any]:
         """Everything of the run that is an array."""

@@ -20,7 +20,7 @@ from tractor_ems.policies.one_step import (
     not_held,
     running_range_w,
 )
-from tractor_ems.policies.q_policy import Normalisation, demand_inputs, soc_input
+from tractor_ems.policies.q_policy import Normalisation, demand_inputs
 from tractor_msgs_py.errors import PolicyError
 from tractor_msgs_py.observation import Observation, ObservationSpec
 from tractor_msgs_py.trajectory import FloatArray
@@ -95,7 +95,17 @@ def time_inputs(time_left_s: FloatArray, horizon_s: float) -> Float32Array:
     return np.stack(columns, axis=1).astype(np.float32)
 
 
-RESERVE_INPUTS = 2
+RESERVE_INPUTS, SOC_INPUTS = 2, 2
+
+FAR_SOC = 0.2
+"""SOC error at which the ends of the window begin to be felt."""
+
+
+def soc_inputs(scaling: Normalisation, error: FloatArray) -> Float32Array:
+    """SOC error of any shape as two network inputs, last: itself, and a fifth power that is small
+    until the ends of the window are near, where the value bends."""
+    far = error / FAR_SOC
+    return np.stack((error / scaling.soc_scale, far**5), axis=-1).astype(np.float32)
 
 
 def reserve_inputs(
@@ -136,7 +146,7 @@ class RunOrStand:
         if not (np.isfinite(self.horizon_s) and self.horizon_s >= 0.0):
             raise PolicyError(f"horizon_s: {self.horizon_s}, must be finite and >= 0")
         known = RESERVE_INPUTS + (TIME_INPUTS if self.horizon_s else 0)
-        wanted = (2 + len(self.spec.filters) + known, 2)
+        wanted = (1 + len(self.spec.filters) + known + SOC_INPUTS, 2)
         for net in self.nets:
             if (net.inputs, net.outputs) != wanted:
                 raise PolicyError(
@@ -197,8 +207,10 @@ class RunOrStand:
     ) -> tuple[FloatArray, FloatArray]:
         """Mean V and G at SOC - step, SOC, SOC + step, (B, 3) each [units]."""
         steps = SLOPE_STEP * np.array([-1.0, 0.0, 1.0])
-        error = soc_input(self.scaling, soc[:, None] + steps, soc_target[:, None])
-        rows = np.concatenate((np.repeat(inputs, 3, axis=0), error.reshape(-1, 1)), axis=1)
+        error = soc_inputs(self.scaling, soc[:, None] + steps - soc_target[:, None])
+        rows = np.concatenate(
+            (np.repeat(inputs, 3, axis=0), error.reshape(-1, SOC_INPUTS)), axis=1
+        )
         outputs = [forward(net, rows).reshape(len(soc), 3, 2) for net in self.nets]
         mean: FloatArray = np.mean(np.stack(outputs), axis=0, dtype=np.float64)
         return mean[..., 0], mean[..., 1]

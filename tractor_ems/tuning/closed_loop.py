@@ -24,6 +24,7 @@ from tractor_ems.optimal.one_step_kernel import (
 )
 from tractor_ems.policies.genset import HOLD_ON_W
 from tractor_ems.policies.one_step import HOLD_S
+from tractor_ems.policies.run_or_stand import FAR_SOC
 from tractor_msgs_py.trajectory import FloatArray, IntArray
 from tractor_sim.batch_kernel import Bounds, Plant, Segments, advance, bounds_of, fuel_of
 
@@ -149,9 +150,12 @@ def drive_choice(
                 for j in range(features):
                     first[i] += w0[n, i, j] * inputs[t, j]
             for k in range(3):
-                place = (error + (k - 1) * slope_step) / soc_scale
+                place = error + (k - 1) * slope_step
+                near, far = place / soc_scale, (place / FAR_SOC) ** 5
                 for i in range(width):
-                    hidden[i] = math.tanh(first[i] + w0[n, i, features] * place)
+                    hidden[i] = math.tanh(
+                        first[i] + w0[n, i, features] * near + w0[n, i, features + 1] * far
+                    )
                 out_v, out_g = b2[n, 0], b2[n, 1]
                 for i in range(b1.shape[1]):
                     total = b1[n, i]
