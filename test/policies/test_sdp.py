@@ -97,6 +97,14 @@ def test_a_table_that_does_not_fit_is_refused(change, named):
         ({"times_s": None}, "metadata"),
         ({"price_kg": "dear"}, "metadata"),
         ({"edges_w": [[1.0]]}, "cells"),
+        ({"edges_w": [[[1.0, 2.0]], []]}, "edges_w: shape"),
+        ({"times_s": [-5.0]}, "times_s: -5.0, must be >= 0"),
+        ({"name": "sdp_unplanned", "times_s": [0.0, 1.0]}, "sdp_unplanned cannot have"),
+        ({"offset": [-0.2, 0.0, 0.1]}, "offset: must be evenly spaced"),
+        ({"gamma": 1.5}, "gamma: 1.5, allowed 0..1"),
+        ({"start_kg": -1.0}, "start_kg: -1.0, allowed"),
+        ({"name": "x" * 10**6}, "name 'xxx"),
+        ({"envelope": {"soc": [1.0]}}, "envelope: expected"),
     ],
 )
 def test_a_damaged_file_is_refused(tmp_path, change, named):
@@ -108,5 +116,6 @@ def test_a_damaged_file_is_refused(tmp_path, change, named):
         "number": np.arange(4, dtype=np.float32),
     }
     write_policy_file(path, tensors, {**metadata, **change})
-    with pytest.raises(PolicyError, match=named):
+    with pytest.raises(PolicyError, match=named) as caught:
         load_made(path)
+    assert len(str(caught.value)) < 2000

@@ -98,7 +98,7 @@ class AEcms:
         """The cheapest engine power, or off."""
         params, soc = self.powertrain, observation.soc
         error = observation.soc_target - soc
-        every = round(ADAPT_EVERY_S / params.dt_s)
+        every = max(round(ADAPT_EVERY_S / params.dt_s), 1)
         due = state.ticks > 0 and state.ticks % every == 0
         raised = state.raised + (self.adapt * error if due else 0.0)
         gain = self.soc_gain + self.stiffen_s / np.maximum(observation.time_left_s, params.dt_s)

@@ -12,7 +12,8 @@ from typing import Any
 
 from tractor_ems.policies.envelope import stored_envelope
 from tractor_ems.policies.made import load_made
-from tractor_msgs_py.errors import ConfigError
+from tractor_ems.policies.protocol import MadePolicy
+from tractor_msgs_py.errors import ConfigError, PolicyError
 from tractor_msgs_py.observation import DemandFilter
 
 SCORES_SUFFIX = ".scores.json"
@@ -76,15 +77,27 @@ def card_of(path: Path, scores: Path | None = None) -> Card:
         scores: file with its scores; None: the one beside it, or else what its metadata says.
 
     Raises:
-        PolicyError: the file is no policy of this package.
+        PolicyError: the file is no policy of this package, or what it says of itself is damaged.
         ConfigError: the scores cannot be read, or hold none of this policy.
     """
     policy = load_made(path)
+    found, operations = _scores(path, policy.name, policy.metadata, scores)
+    try:
+        return _card(path, policy, found, operations)
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise PolicyError(f"{path}: metadata has no card in it ({error!r:.200})") from None
+
+
+def _card(
+    path: Path,
+    policy: MadePolicy,
+    found: dict[str, Any],
+    operations: dict[str, dict[str, Any]],
+) -> Card:
     data, spec = policy.metadata, policy.spec
     times_s = [float(data.get("horizon_s", 0.0)), *map(float, data.get("times_s", ()))]
     horizon_s = 0.0 if policy.name.endswith("unplanned") else max(times_s)
     seed = data.get("seed")
-    found, operations = _scores(path, policy.name, data, scores)
     return Card(
         file=path.name,
         sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
@@ -116,7 +129,8 @@ def _scores(
     beside = path.with_suffix(SCORES_SUFFIX)
     file = given or (beside if beside.is_file() else None)
     if file is None:
-        return dict(data.get("scores", {})), {}
+        stored = data.get("scores", {})
+        return dict(stored) if isinstance(stored, Mapping) else {}, {}
     try:
         document = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -126,8 +140,13 @@ def _scores(
         found = found.get(name)
     if not isinstance(found, dict):
         raise ConfigError(f"{file}: holds no scores of policy {name}")
-    operations = document.get("per_operation", {}).get(name, {}) if found is not document else {}
-    return found, operations
+    if found is document:
+        return found, {}
+    try:
+        listed = document["per_operation"][name] if "per_operation" in document else {}
+        return found, {operation: dict(own) for operation, own in listed.items()}
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise ConfigError(f"{file}: per_operation: no scores of policy {name}") from None
 
 
 def limits_of(card: Card) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from tractor_ems.policies import knot_q_file, q_policy, run_or_stand_file, sdp_file
+from tractor_ems.policies.envelope import stored_envelope
 from tractor_ems.policies.mlp import Float32Array
 from tractor_ems.policies.policy_file import read_policy
 from tractor_ems.policies.protocol import MadePolicy
@@ -34,6 +35,7 @@ def _made(tensors: dict[str, Float32Array], metadata: dict[str, Any]) -> MadePol
     kind = metadata["kind"]
     if kind not in MAKERS:
         raise PolicyError(f"kind {kind!r}, allowed {', '.join(MAKERS)}")
+    stored_envelope(metadata)  # a damaged one is refused with the file's name
     return MAKERS[kind](tensors, metadata)
 
 

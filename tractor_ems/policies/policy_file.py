@@ -26,6 +26,9 @@ _KEY = "tractor_ems.policy"
 
 _MAX_BYTES = 256 * 1024 * 1024
 
+LONGEST_TEXT = 1000
+"""Of what is said about a damaged file."""
+
 
 def write_policy_file(
     path: Path, tensors: Mapping[str, Float32Array], metadata: Mapping[str, Any]
@@ -97,9 +100,9 @@ def read_policy(
     try:
         return make(tensors, metadata)
     except (PolicyError, ConfigError) as error:
-        raise PolicyError(f"{path}: {error}") from None
+        raise PolicyError(f"{path}: {_short(str(error))}") from None
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise PolicyError(f"{path}: metadata is not a policy's ({error!r})") from None
+        raise PolicyError(f"{path}: metadata is not a policy's ({_short(repr(error))})") from None
 
 
 def params_of(metadata: Mapping[str, Any]) -> PowertrainParams:
@@ -111,6 +114,11 @@ def params_of(metadata: Mapping[str, Any]) -> PowertrainParams:
     if powertrain_hash(params) != metadata["powertrain_hash"]:
         raise PolicyError("powertrain parameters do not match their hash")
     return params
+
+
+def _short(text: str) -> str:
+    """A file may hold a name or list of any length; what is said of it may not."""
+    return text if len(text) <= LONGEST_TEXT else f"{text[:LONGEST_TEXT]} ..."
 
 
 def _describe(tensor: np.ndarray[Any, Any]) -> str:

@@ -56,9 +56,9 @@ class Prices:
     def __post_init__(self) -> None:
         for name in ("soc_kg", "start_kg", "end_kg", "ease_kg_s", "unit_kg"):
             value = getattr(self, name)
-            least = "> 0" if name in ("ease_kg_s", "unit_kg") else ">= 0"
-            if not np.isfinite(value) or value < 0 or (value == 0 and least == "> 0"):
-                raise PolicyError(f"prices.{name}: {value}, must be finite and {least}")
+            least = 1e-9 if name in ("ease_kg_s", "unit_kg") else 0.0
+            if not least <= value <= 1e9:
+                raise PolicyError(f"prices.{name}: {value}, allowed {least:g}..1e9")
 
 
 def prices_of(params: PowertrainParams, price: float, end_kg: float) -> Prices:

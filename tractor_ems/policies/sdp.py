@@ -4,6 +4,7 @@ The table is a value after the decision over (demand situation, SOC error, engin
 Markov chain of recorded demand; see ``optimal.sdp``.
 """
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -58,7 +59,7 @@ class SdpPolicy:
     metadata: dict[str, Any] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
-        cells = int(np.prod([len(inner) + 1 for inner in self.edges]))
+        cells = math.prod(len(inner) + 1 for inner in self.edges)
         if len(self.edges) != len(self.filters) + 1 or self.number.shape != (cells,):
             raise PolicyError(
                 f"{self.name}: {len(self.edges)} grid features with {self.number.shape} cells, "
