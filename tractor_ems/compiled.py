@@ -13,7 +13,11 @@ _ROOT = Path(__file__).resolve().parents[1]
 _SOURCES = (
     "tractor_ems/learning/*.py",
     "tractor_ems/optimal/*.py",
+    "tractor_ems/policies/genset.py",
+    "tractor_ems/policies/one_step.py",
+    "tractor_ems/policies/run_or_stand.py",
     "tractor_ems/study/experts.py",
+    "tractor_ems/tuning/closed_loop.py",
     "tractor_sim/*.py",
 )
 """Every file with compiled functions, and every file whose constants they use."""

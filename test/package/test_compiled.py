@@ -1,5 +1,6 @@
 """Compiled code is never older than its sources, whichever file they stand in."""
 
+import ast
 import os
 import shutil
 import subprocess
@@ -36,6 +37,15 @@ def test_every_file_with_compiled_functions_is_among_the_sources() -> None:
         if "import njit" in path.read_text() or "import register_jitable" in path.read_text()
     }
     assert compiled and compiled <= named
+    constants_of = {
+        root / f"{node.module.replace('.', '/')}.py"
+        for path in compiled
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ImportFrom)
+        and (node.module or "").startswith(PACKAGES)
+        and any(item.name.isupper() for item in node.names)
+    }
+    assert constants_of <= named
 
 
 def test_the_cache_is_named_by_the_sources() -> None:
