@@ -21,7 +21,11 @@ def train(
         str | None, typer.Option(help="config/training name or YAML file with every setting.")
     ] = None,
     targets: Annotated[
-        str | None, typer.Option(help="counterfactual (default) or sampled (the paper's way).")
+        str | None,
+        typer.Option(
+            help="counterfactual (default), run_or_stand (engines that start slowly: preset "
+            "field) or sampled (the paper's way)."
+        ),
     ] = None,
     reward: Annotated[
         str | None,
@@ -64,7 +68,7 @@ def train(
     Ctrl-C leaves a checkpoint beside the output; --resume goes on from it and gives the same
     bytes as a run that was never interrupted.
     """
-    from tractor_ems.learning.config import load_train_config, rule_share_of
+    from tractor_ems.learning.config import load_train_config, preset_of, rule_share_of
     from tractor_ems.learning.train import train as run
     from tractor_ems.signals.config import optional_map
 
@@ -79,7 +83,7 @@ def train(
         "allow_other_powertrain": True if allow_other_powertrain else None,
         "allow_held_out": True if allow_held_out else None,
     }
-    config = load_train_config(preset or targets, overrides)
+    config = load_train_config(preset or preset_of(targets), overrides)
     with Progress(
         TextColumn("training"),
         BarColumn(),

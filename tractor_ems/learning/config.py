@@ -130,14 +130,15 @@ class Augmentation:
 
 @dataclass(frozen=True, config=_STRICT)
 class RunOrStandConfig:
-    """Double Q-learning of letting the engine run or stand, for engines that start slowly.
+    """Letting the engine run or stand, for engines that start slowly; see ``run_or_stand``.
 
     Attributes:
         planned: the policy knows when the work is planned to end and pays for SOC then; else it
             pays for being off its target all the time.
         updates, batch: gradient steps; ticks per step, each at ``errors`` SOC errors.
         learning_rate, hold_fraction, final_fraction: as in ``CounterfactualConfig``.
-        target_rate: share of the online net that the averaged one takes over per update.
+        target_rate: share of the online net that the averaged one takes over per update; the
+            averaged one is the policy's.
         gamma: discount per second.
         commit_s: how long a choice lasts in the targets.
         horizon_s: farthest time left that is learned; near_end: share of the samples drawn from
@@ -151,8 +152,10 @@ class RunOrStandConfig:
         gain_weight: weight of G's squared error against that of V about its mean per tick.
         margin_kg: added to what standing saves when the policy is made: near the top of the window
             a price that is a little too low stops the charging, and the engine would idle on.
+            Chosen by hand on the dev cycles.
         short_kg_per_j: price of demand left unmet.
-        double: choose with the online net, evaluate with the averaged one.
+        double: choose with the online net, evaluate with the averaged one; of no effect while
+            ``table_updates`` last.
         hidden: of the network, tanh.
         table_updates: first updates whose targets go on with the values of stochastic DP, fitted
             to the same demand, instead of the network's own; 0: none, nothing is fitted.
@@ -292,6 +295,11 @@ def rule_share_of(given: float | None, rule_bags: Sequence[object] | None) -> fl
     if given is not None and given >= 0:
         return given
     return 0.25 if any(rule_bags or ()) else None
+
+
+def preset_of(targets: str | None) -> str | None:
+    """The shipped preset that stands for targets named without one; None for none."""
+    return {"run_or_stand": "field"}.get(targets or "", targets) or None
 
 
 def load_train_config(

@@ -16,7 +16,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from tractor_ems.learning.config import load_train_config, rule_share_of
+from tractor_ems.learning.config import Targets, load_train_config, preset_of, rule_share_of
 from tractor_ems.learning.rewards import RewardKind
 from tractor_ems.learning.train import TrainReport, train
 from tractor_ems.signals.config import optional_map
@@ -26,16 +26,15 @@ from tractor_msgs_py.topics import Qos
 
 PUBLISH_S = 0.5
 PROGRESS_QOS = Qos(durability="transient_local", depth=1)
-TARGETS = ("", "counterfactual", "sampled")
 
 PARAMETERS = (
     Parameter("bags", [""], "bags or folders of bags to learn from, required"),
     Parameter("rule_bags", [""], "rule-based bags for the seeding of sampled targets"),
     Parameter("output", "", "policy file to write (.safetensors), required"),
-    Parameter("preset", "", "config/training name or YAML file; empty: that of the targets"),
-    Parameter("targets", "", "empty: the preset's, or else counterfactual", choices=TARGETS),
+    Parameter("preset", "", "config/training name or YAML file; empty: of the targets"),
+    Parameter("targets", "", "empty: the preset's", choices=("", *get_args(Targets))),
     Parameter("reward", "", "empty: the preset's", choices=("", *get_args(RewardKind))),
-    Parameter("powertrain", "paper", "shipped name or YAML file of the powertrain"),
+    Parameter("powertrain", "", "shipped name or YAML file; empty: the preset's"),
     Parameter("signals", "", "signal map of a vehicle's bags; empty: the project's own topics"),
     Parameter("updates", 0, "gradient steps, 0: the preset's", "", 0, 100_000_000),
     Parameter("seed", -1, "seed of every generator, -1: the preset's", "", -1, 2**62),
@@ -58,9 +57,8 @@ class Trainer:
             raise ConfigError("parameter output: is empty, give the policy file to write")
         if not bags and values["interact"] < 1:
             raise ConfigError("parameter bags: is empty, give the bags to learn from")
-        config = load_train_config(
-            values["preset"] or values["targets"] or "counterfactual", _overrides(values)
-        )
+        preset = values["preset"] or preset_of(values["targets"]) or "counterfactual"
+        config = load_train_config(preset, _overrides(values))
         self._publisher = node.create_publisher(String, "~/progress", qos_profile(PROGRESS_QOS))
         self._clock = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(PUBLISH_S, self._publish, clock=self._clock)
@@ -128,7 +126,7 @@ def _overrides(values: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "targets": values["targets"] or None,
         "reward.kind": values["reward"] or None,
-        "powertrain": values["powertrain"],
+        "powertrain": values["powertrain"] or None,
         "updates": values["updates"] or None,
         "seed": None if values["seed"] < 0 else values["seed"],
         "interact": None if values["interact"] < 0 else values["interact"],
