@@ -12,6 +12,7 @@ from tractor_ems.learning.config import (
     RunOrStandConfig,
     TrainConfig,
     load_train_config,
+    preset_of,
 )
 from tractor_ems.learning.counterfactual import make_problem as make_counterfactual
 from tractor_ems.learning.run_or_stand import MOST_STARTS, RunOrStandLearner, make_problem
@@ -135,7 +136,28 @@ def test_standing_saves_the_fuel_of_idling_and_costs_no_start_while_it_lasts(con
     ticks = np.arange(20, 60)
     _, gain = made.backup(ticks, np.full(40, 1000), np.zeros((40, 1)))
     idling_kg = made.problem.commit * FIELD.engine.idle_fuel_kg_per_s
-    assert np.median(gain) * made.problem.prices.unit_kg == pytest.approx(idling_kg, rel=0.3)
+    assert np.median(gain) * made.problem.prices.unit_kg == pytest.approx(idling_kg, rel=0.1)
+
+
+def test_where_starts_are_free_there_is_still_a_choice_to_learn():
+    free = load_powertrain("field:engine.start_fuel_kg=0")
+    demand_w = work(900)
+    problem = make_problem(free, SMALL, [demand_w], inputs_of(demand_w), 1)
+    rngs = (np.random.Generator(np.random.PCG64(n)) for n in (0, 100))
+    made = known_only(RunOrStandLearner(problem, SMALL, *rngs))
+    _, gain = made.backup(np.arange(20, 60), np.full(40, 1000), np.zeros((40, 1)))
+    assert gain.any()
+
+
+def test_steps_that_are_not_seconds_are_refused():
+    """The reserve in training counts seconds."""
+    with pytest.raises(ConfigError, match=r"dt_s: 0\.1 with targets run_or_stand, allowed 1"):
+        make_problem(load_powertrain("field:dt_s=0.1"), SMALL, [work(900)], None, 1)
+
+
+def test_targets_alone_name_their_preset():
+    assert load_train_config(preset_of("run_or_stand")) == load_train_config("field")
+    assert (preset_of("sampled"), preset_of(None), preset_of("")) == ("sampled", None, None)
 
 
 def test_what_the_battery_cannot_carry_alone_is_no_choice():

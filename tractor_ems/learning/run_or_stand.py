@@ -1,4 +1,4 @@
-"""Counterfactual double Q-learning of one choice: let the engine run or stand for some seconds.
+"""Counterfactual learning of one choice: let the engine run or stand for some seconds.
 
 Demand is exogenous and the plant is known, so a recorded stretch of ``commit`` steps of demand
 teaches what running and standing cost over it from any SOC and, because any tick may be followed
@@ -12,6 +12,9 @@ so that V_on = min(V, V - G) and V_off = min(V + start, V - G). The power of a r
 the one of least fuel at the price of energy that V's slope over SOC gives. To V belongs a known
 part, ``stiffness_kg`` e^2: what ending e away from the target costs where only the battery's
 losses stand in the way.
+
+What follows a stretch is worth what stochastic DP says for the first ``table_updates`` updates (in
+the presets: for all), then what the network says itself, by double Q-learning.
 
 Why seconds and not steps: one more second of running costs 0.2 g, less than any network's error,
 and a policy that compared single steps put off each stop for ever.
@@ -65,6 +68,9 @@ FUEL_KNOTS = 4097
 MOST_STARTS = 3.0
 """Bound of |G| in starts: beyond it the choice is clear, and its size is of no use."""
 
+LEAST_START_KG = 0.005
+"""What a start counts as at least in that bound: G is to be learned where starts are free, too."""
+
 
 @dataclass(frozen=True)
 class Problem:
@@ -115,9 +121,11 @@ def make_problem(
     the first ``recorded`` of them were recorded, the others made from those.
 
     Raises:
-        ConfigError: no trace is longer than a stretch.
+        ConfigError: no trace is longer than a stretch, or steps are not of a second.
     """
     battery, engine, dt_s = params.battery, params.engine, params.dt_s
+    if dt_s != 1.0:  # ``stretches.reserve`` counts steps of a second
+        raise ConfigError(f"dt_s: {dt_s:g} with targets run_or_stand, allowed 1")
     commit = max(round(config.commit_s / dt_s), 1)
     ends = np.cumsum([len(d) for d in demands_w])
     begins = np.append(0, ends[:-1])
@@ -245,7 +253,6 @@ class RunOrStandLearner:
             prices.start_kg, gamma, p.min_off, p.ramp_w, c.short_kg_per_j * p.dt_s, self.holding,
             p.must_start, cost, end, end_on,
         )  # fmt: skip
-        start = prices.start_kg / prices.unit_kg
         after, end = tick + steps, end.reshape(b, 2 * k)
         then_left = left - steps
         on, off = self.best(after, then_left, end)
@@ -255,7 +262,7 @@ class RunOrStandLearner:
             then = np.where(over, self.known(then_left, end), then)
         then *= (gamma**steps)[:, None]
         total = (cost.reshape(b, 2 * k) / prices.unit_kg + then).reshape(b, k, 2)
-        most = MOST_STARTS * start
+        most = MOST_STARTS * (max(prices.start_kg, LEAST_START_KG) / prices.unit_kg)
         return total[..., 0], np.clip(total[..., 0] - total[..., 1], -most, most)
 
     def draw(self) -> tuple[IntArray, IntArray, FloatArray]:
