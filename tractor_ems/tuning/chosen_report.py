@@ -48,7 +48,7 @@ shorter strokes than any recording. It decided nothing.
 - `ecms`: the classic one. Free to stop, a start counts nothing, the present demand decides.
 - `a_ecms_unplanned`: a start is written off over a time, smoothed demand decides on it, SOC is fed
   back. `a_ecms` also knows the planned end: its feedback stiffens as soc_gain + stiffen_s / time
-  left, so SOC swings first and lands at its target.
+  left, so SOC swings first and lands at its target. The planned end is the cycle's real one.
 - `sdp_unplanned`, `sdp`: stochastic dynamic programming on a Markov chain of demand, fitted here
   to the demand of the training cycles, by `ems tune sdp` to that of bags. `sdp` has a table of
   values for each of 15 times left; `sdp_unplanned` has one and a cost of SOC off its target.
