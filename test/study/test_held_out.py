@@ -64,6 +64,14 @@ def test_smoke_touches_no_held_out_cycle():
         ({"disturbances": [{"name": "none"}]}, "disturbances"),
         ({"rules": ["sdp"]}, "a name twice"),
         ({"surprise": 1}, "surprise"),
+        ({"bars": {**shipped()["bars"], "median": float("nan")}}, "bars.median"),
+        ({"smoke": {"cycles": ["nowhere_1"]}}, "nowhere_1"),
+        ({"smoke": {"train_seeds": [3, 1]}}, r"train_seeds: \[3, 1\]"),
+        ({"recorders": ["nobody"]}, "recorders: 'nobody', allowed conventional"),
+        ({"rules": [*shipped()["rules"], "nobody"]}, "rules: 'nobody'"),
+        ({"powertrain": "nothing"}, "powertrain 'nothing'"),
+        ({"vehicles": [{"powertrain": "nothing", "scale": 1.0}]}, "powertrain 'nothing'"),
+        ({"learners": [{"name": "ddqn_counterfactual", "preset": "no"}]}, "preset 'no'"),
     ],
 )
 def test_settings_that_make_no_study_are_refused_by_name(tmp_path, change, message):

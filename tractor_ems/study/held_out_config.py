@@ -7,10 +7,12 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
-from tractor_ems.learning.config import Count, Fraction
+from tractor_ems.learning.config import Count, Fraction, load_train_config
+from tractor_ems.policies.registry import RULES
 from tractor_ems.study.disturbances import Disturbance
-from tractor_msgs_py.errors import ConfigError
-from tractor_sim.config import describe
+from tractor_ems.study.held_out_policies import DP
+from tractor_msgs_py.errors import ConfigError, TractorEmsError
+from tractor_sim.config import describe, load_powertrain
 from tractor_sim.duty_cycle.library import cycle_names, listed_cycles
 from tractor_sim.duty_cycle.splits import Listed
 from tractor_sim.resources import resource_path
@@ -20,6 +22,7 @@ _STRICT = ConfigDict(extra="forbid")
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")]
 Few = Annotated[int, Field(ge=0, le=1000)]
+Bar = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True, config=_STRICT)
@@ -61,20 +64,20 @@ class Bars:
         bug: a dp_ratio above this is a bug, not a result.
     """
 
-    median: float
-    worst: float
-    stretch_median: float
-    stretch_worst: float
-    soc_each: float
-    soc_mean: float
-    starts: float
-    lossy: float
-    train_s: float
+    median: Bar
+    worst: Bar
+    stretch_median: Bar
+    stretch_worst: Bar
+    soc_each: Bar
+    soc_mean: Bar
+    starts: Bar
+    lossy: Bar
+    train_s: Bar
     transitions: Count
-    fewer_episodes: float
+    fewer_episodes: Bar
     paper_episodes: Count
     robust: Fraction
-    bug: float
+    bug: Bar
 
 
 @dataclass(frozen=True, config=_STRICT)
@@ -223,15 +226,17 @@ def load_held_out(settings: str, preset: str) -> HeldOutConfig:
 
     Raises:
         ConfigError: the file is missing, has an unknown key or a value out of range, or no such
-            preset; a training cycle is not of the training split.
+            preset; a training cycle is not of the training split; something named in it is not
+            there.
     """
     path = Path(settings)
     if path.suffix not in (".yaml", ".yml"):
         path = resource_path("config", "study") / f"{settings}.yaml"
     if not path.is_file():
         raise ConfigError(f"study settings {settings!r}: no such file")
+    document = read_yaml(path)
     try:
-        file = TypeAdapter(_File).validate_python(read_yaml(path))
+        file = TypeAdapter(_File).validate_python(document)
     except ValidationError as error:
         raise ConfigError(f"{path}: {describe(error)}") from None
     except ConfigError as error:
@@ -239,14 +244,43 @@ def load_held_out(settings: str, preset: str) -> HeldOutConfig:
     if preset not in file.presets:
         raise ConfigError(f"{path}: preset {preset!r}, allowed {', '.join(file.presets)}")
     config = HeldOutConfig(preset, file, file.presets[preset])
+    try:
+        _check_cycles(config)
+        _check_named(config.settings)
+    except TractorEmsError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    return config
+
+
+def _check_cycles(config: HeldOutConfig) -> None:
+    budget = config.budget
+    for field in ("train_seeds", "transfer_seeds"):
+        first, last = getattr(budget, field)
+        if first > last:
+            raise ConfigError(f"{field}: [{first}, {last}], allowed the lower seed first")
     for name in (*config.training, *config.transfer_training):
         split = _listed(name).split
         if split != "train":
-            raise ConfigError(f"{path}: training cycle {name} is {split}, allowed train")
-    for name in config.budget.dev:
+            raise ConfigError(f"training cycle {name} is {split}, allowed train")
+    for name in budget.dev:
         if _listed(name).split == "held_out":
-            raise ConfigError(f"{path}: dev cycle {name} is held_out, allowed train, validation")
-    for name in config.budget.traces:
+            raise ConfigError(f"dev cycle {name} is held_out, allowed train, validation")
+    for name in config.scored:
+        _listed(name)
+    for name in budget.traces:
         if name not in config.scored:
-            raise ConfigError(f"{path}: traces: {name} is not among the scored cycles")
-    return config
+            raise ConfigError(f"traces: {name} is not among the scored cycles")
+
+
+def _check_named(settings: _File) -> None:
+    """Whatever is named can be had: a study gets to some of it after hours only."""
+    load_powertrain(settings.powertrain)
+    for vehicle in settings.vehicles:
+        load_powertrain(vehicle.powertrain)
+    for learner in settings.learners:
+        load_train_config(learner.preset)
+    allowed = (*RULES, DP)
+    for field in ("recorders", "rules"):
+        for name in getattr(settings, field):
+            if name not in allowed:
+                raise ConfigError(f"{field}: {name!r}, allowed {', '.join(allowed)}")
