@@ -134,7 +134,7 @@ def test_a_run_killed_before_its_policy_was_written_resumes_to_the_same_bytes(
         raise InterruptedError
 
     with monkeypatch.context() as patch:
-        patch.setattr("tractor_ems.learning.train.save_policy", killed)
+        patch.setattr("tractor_ems.learning.experiment.save_policy", killed)
         with pytest.raises(InterruptedError):
             train(config, [bags / "best"], [], out, command_line="x")
     train(config, [bags / "best"], [], out, resume=True, command_line="x --resume")
