@@ -128,10 +128,8 @@ def _print_columns(
     print_table(title, [heading for heading, _ in columns.values()], cells)
 
 
-@contextmanager
-def counting(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A bar on stderr that is told how many are done; nothing where stderr is no terminal."""
-    with Progress(
+def _bars() -> Progress:
+    return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
@@ -139,7 +137,13 @@ def counting(what: str, total: int) -> Iterator[Callable[[int], None]]:
         TimeRemainingColumn(),
         console=NOTES,
         disable=not NOTES.is_terminal,
-    ) as bar:
+    )
+
+
+@contextmanager
+def counting(what: str, total: int) -> Iterator[Callable[[int], None]]:
+    """A bar on stderr that is told how many are done; nothing where stderr is no terminal."""
+    with _bars() as bar:
         task = bar.add_task(what, total=total)
         yield lambda done: bar.update(task, completed=done)
 
@@ -147,15 +151,7 @@ def counting(what: str, total: int) -> Iterator[Callable[[int], None]]:
 @contextmanager
 def stages() -> Iterator[Callable[[str, int, int], None]]:
     """A bar per stage on stderr, told its name, how many are done and how many there are."""
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        console=NOTES,
-        disable=not NOTES.is_terminal,
-    ) as bar:
+    with _bars() as bar:
         tasks: dict[str, TaskID] = {}
 
         def show(what: str, done: int, total: int) -> None:

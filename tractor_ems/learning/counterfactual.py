@@ -13,7 +13,6 @@ part of the cost, lambda P_dem, drowned the differences between actions and the 
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -33,11 +32,8 @@ from tractor_ems.learning.config import (
 )
 from tractor_ems.learning.networks import (
     Net,
-    adam_tensors,
+    Resumable,
     copy_towards,
-    load_adam,
-    load_net,
-    net_tensors,
     to_numpy,
 )
 from tractor_ems.learning.rewards import RewardConfig, battery_price, running_cost, start_cost
@@ -237,7 +233,7 @@ def values(net: Net, inputs: Tensor, start_units: float) -> tuple[Tensor, Tensor
     return w_on, w_on + start_units * torch.sigmoid(outputs[:, 1])
 
 
-class CounterfactualLearner:
+class CounterfactualLearner(Resumable):
     """Networks, optimiser and generators of one run; :meth:`update` is one gradient step."""
 
     def __init__(
@@ -255,9 +251,7 @@ class CounterfactualLearner:
         self.online = Net(sizes, config.activation, init_rng)
         self.target = Net(sizes, config.activation, init_rng)
         copy_towards(self.target, self.online, 1.0)
-        self.optimiser = torch.optim.Adam(
-            self.online.parameters(), lr=config.learning_rate, fused=True
-        )
+        self.adam = torch.optim.Adam(self.online.parameters(), lr=config.learning_rate, fused=True)
 
     def update(self) -> dict[str, Tensor]:
         """Draw (bag, time), SOC and target; regress both engine states' values on the backup."""
@@ -279,10 +273,10 @@ class CounterfactualLearner:
             if config.loss == "huber"
             else torch.nn.functional.mse_loss(w, y)
         )
-        self.optimiser.param_groups[0]["lr"] = learning_rate(config, self.step)
-        self.optimiser.zero_grad(set_to_none=True)
+        self.adam.param_groups[0]["lr"] = learning_rate(config, self.step)
+        self.adam.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
-        self.optimiser.step()
+        self.adam.step()
         copy_towards(self.target, self.online, self.target_rate)
         self.step += 1
         return {"losses/td_loss": loss.detach(), "losses/q_values": -w.detach().mean()}
@@ -290,23 +284,3 @@ class CounterfactualLearner:
     def network(self) -> Mlp:
         """The online network, for a policy."""
         return to_numpy(self.online)
-
-    def tensors(self) -> dict[str, Any]:
-        """Everything of the run that is an array."""
-        return {
-            **net_tensors(self.online, "online"),
-            **net_tensors(self.target, "target"),
-            **adam_tensors(self.optimiser),
-        }
-
-    def state(self) -> dict[str, Any]:
-        """Everything else: step and generator."""
-        return {"step": self.step, "sample_rng": self.rng.bit_generator.state}
-
-    def restore(self, tensors: dict[str, Any], state: dict[str, Any]) -> None:
-        """Continue where :meth:`tensors` and :meth:`state` were taken."""
-        load_net(self.online, tensors, "online")
-        load_net(self.target, tensors, "target")
-        load_adam(self.optimiser, tensors)
-        self.step = int(state["step"])
-        self.rng.bit_generator.state = state["sample_rng"]

@@ -9,7 +9,6 @@ weight and without the first term it is imitation.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,11 +19,8 @@ from tractor_ems.learning.knot_samples import KnotSamples, running_baseline_kg
 from tractor_ems.learning.knots_config import KnotsConfig
 from tractor_ems.learning.networks import (
     Net,
-    adam_tensors,
+    Resumable,
     copy_towards,
-    load_adam,
-    load_net,
-    net_tensors,
     to_numpy,
 )
 from tractor_ems.learning.rewards import RewardConfig, battery_price, start_cost
@@ -169,7 +165,7 @@ def best_value(chooser: Tensor, judge: Tensor, mask: Tensor) -> Tensor:
     return judge.gather(1, best[:, None])[:, 0]
 
 
-class KnotLearner:
+class KnotLearner(Resumable):
     """Networks, optimiser and generator of one run; :meth:`update` is one gradient step."""
 
     def __init__(
@@ -337,26 +333,6 @@ class KnotLearner:
             (*net.biases[:-1], np.ascontiguousarray(bias[:-1] + scale * bias[-1:])),
             net.activation,
         )
-
-    def tensors(self) -> dict[str, Any]:
-        """Every array of the run."""
-        return {
-            **net_tensors(self.online, "online"),
-            **net_tensors(self.target, "target"),
-            **adam_tensors(self.adam),
-        }
-
-    def state(self) -> dict[str, Any]:
-        """Everything else."""
-        return {"step": self.step, "sample_rng": self.rng.bit_generator.state}
-
-    def restore(self, tensors: dict[str, Any], state: dict[str, Any]) -> None:
-        """Continue where :meth:`tensors` and :meth:`state` were taken."""
-        load_net(self.online, tensors, "online")
-        load_net(self.target, tensors, "target")
-        load_adam(self.adam, tensors)
-        self.step = int(state["step"])
-        self.rng.bit_generator.state = state["sample_rng"]
 
 
 VALUE_SCALE = 10.0

@@ -115,3 +115,38 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+class Resumable:
+    """What every learner of an online and an averaged network keeps in a checkpoint.
+
+    Attributes:
+        online, target: the networks; adam: of the online one.
+        step: gradient steps done; rng: draws the samples.
+    """
+
+    online: Net
+    target: Net
+    adam: torch.optim.Adam
+    step: int
+    rng: np.random.Generator
+
+    def tensors(self) -> dict[str, Any]:
+        """Everything of the run that is an array."""
+        return {
+            **net_tensors(self.online, "online"),
+            **net_tensors(self.target, "target"),
+            **adam_tensors(self.adam),
+        }
+
+    def state(self) -> dict[str, Any]:
+        """Everything else: step and generator."""
+        return {"step": self.step, "sample_rng": self.rng.bit_generator.state}
+
+    def restore(self, tensors: dict[str, Any], state: dict[str, Any]) -> None:
+        """Continue where :meth:`tensors` and :meth:`state` were taken."""
+        load_net(self.online, tensors, "online")
+        load_net(self.target, tensors, "target")
+        load_adam(self.adam, tensors)
+        self.step = int(state["step"])
+        self.rng.bit_generator.state = state["sample_rng"]

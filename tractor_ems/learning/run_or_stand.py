@@ -33,11 +33,8 @@ import torch
 from tractor_ems.learning.config import RunOrStandConfig, learning_rate
 from tractor_ems.learning.networks import (
     Net,
-    adam_tensors,
+    Resumable,
     copy_towards,
-    load_adam,
-    load_net,
-    net_tensors,
     to_numpy,
 )
 from tractor_ems.learning.sdp_table import Table, make_table
@@ -171,7 +168,7 @@ def make_problem(
     )
 
 
-class RunOrStandLearner:
+class RunOrStandLearner(Resumable):
     """Networks, optimiser and generator of one run; :meth:`update` is one gradient step."""
 
     def __init__(
@@ -311,23 +308,3 @@ class RunOrStandLearner:
         net = to_numpy(self.target)
         net.biases[-1][1] += np.float32(self.config.margin_kg / self.problem.prices.unit_kg)
         return net
-
-    def tensors(self) -> dict[str, Any]:
-        """Everything of the run that is an array."""
-        return {
-            **net_tensors(self.online, "online"),
-            **net_tensors(self.target, "target"),
-            **adam_tensors(self.adam),
-        }
-
-    def state(self) -> dict[str, Any]:
-        """Everything else: step and generator."""
-        return {"step": self.step, "sample_rng": self.rng.bit_generator.state}
-
-    def restore(self, tensors: dict[str, Any], state: dict[str, Any]) -> None:
-        """Continue where :meth:`tensors` and :meth:`state` were taken."""
-        load_net(self.online, tensors, "online")
-        load_net(self.target, tensors, "target")
-        load_adam(self.adam, tensors)
-        self.step = int(state["step"])
-        self.rng.bit_generator.state = state["sample_rng"]

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from tractor_ems.policies.knot_q import KnotQ, Measured
-from tractor_ems.policies.mlp import Float32Array, Mlp
-from tractor_ems.policies.policy_file import params_of, write_policy_file
+from tractor_ems.policies.mlp import Float32Array
+from tractor_ems.policies.policy_file import network_of, params_of, write_policy_file
 from tractor_ems.policies.q_policy import LAYERS_MAX, Normalisation
 from tractor_msgs_py.errors import PolicyError
 from tractor_msgs_py.observation import ObservationSpec
@@ -58,20 +58,10 @@ def knot_q_from(tensors: dict[str, Float32Array], data: dict[str, Any]) -> KnotQ
     names = {f"layer{n}.{part}" for n in range(layers) for part in ("weight", "bias")}
     if set(tensors) != names:
         raise PolicyError(f"tensors {sorted(tensors)}, expected {sorted(names)}")
-    weights = tuple(tensors[f"layer{n}.weight"] for n in range(layers))
-    biases = tuple(tensors[f"layer{n}.bias"] for n in range(layers))
-    width: int | None = None
-    for n, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
-        fits = weight.ndim == 2 and bias.shape == weight.shape[:1]
-        if not fits or (width is not None and weight.shape[1] != width):
-            raise PolicyError(
-                f"layer {n}: weight {weight.shape} and bias {bias.shape} do not fit {width} inputs"
-            )
-        width = weight.shape[0]
     policy = KnotQ(
         params=params_of(data),
         spec=ObservationSpec.from_json(data["observation"]),
-        net=Mlp(weights, biases, activation),
+        net=network_of(tensors, layers, activation),
         scaling=Normalisation(**data["normalisation"]),
         horizon_s=float(data["horizon_s"]),
         measured=_measured(data["measured"]),

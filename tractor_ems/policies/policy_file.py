@@ -12,7 +12,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from tractor_ems.policies.mlp import Float32Array
+from tractor_ems.policies.mlp import Activation, Float32Array, Mlp
 from tractor_msgs_py.atomic import write_bytes
 from tractor_msgs_py.errors import ConfigError, PolicyError
 from tractor_sim.powertrain import PowertrainParams
@@ -103,6 +103,28 @@ def read_policy(
         raise PolicyError(f"{path}: {_short(str(error))}") from None
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise PolicyError(f"{path}: metadata is not a policy's ({_short(repr(error))})") from None
+
+
+def network_of(
+    tensors: Mapping[str, Float32Array], layers: int, activation: Activation, prefix: str = ""
+) -> Mlp:
+    """The network in the tensors PREFIXlayerN.weight and PREFIXlayerN.bias.
+
+    Raises:
+        PolicyError: layers do not fit each other.
+    """
+    weights = tuple(tensors[f"{prefix}layer{n}.weight"] for n in range(layers))
+    biases = tuple(tensors[f"{prefix}layer{n}.bias"] for n in range(layers))
+    width: int | None = None
+    for n, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+        fits = weight.ndim == 2 and bias.shape == weight.shape[:1]
+        if not fits or (width is not None and weight.shape[1] != width):
+            raise PolicyError(
+                f"{prefix}layer {n}: weight {weight.shape} and bias {bias.shape} do not fit "
+                f"{width} inputs"
+            )
+        width = weight.shape[0]
+    return Mlp(weights, biases, activation)
 
 
 def params_of(metadata: Mapping[str, Any]) -> PowertrainParams:

@@ -12,7 +12,7 @@ import numpy as np
 from tractor_ems.learning.rewards import RewardConfig, battery_price, running_cost, start_cost
 from tractor_ems.policies.action_grid import feasible_range, in_range
 from tractor_ems.policies.mlp import Float32Array, Mlp, forward
-from tractor_ems.policies.policy_file import params_of, read_policy, write_policy_file
+from tractor_ems.policies.policy_file import network_of, params_of, read_policy, write_policy_file
 from tractor_ems.policies.protocol import limits_of
 from tractor_msgs_py.errors import PolicyError
 from tractor_msgs_py.observation import Observation, ObservationSpec
@@ -314,17 +314,6 @@ def policy_from(tensors: dict[str, Float32Array], data: dict[str, Any]) -> QPoli
     names = {f"layer{n}.{part}" for n in range(layers) for part in ("weight", "bias")}
     if set(tensors) != names:
         raise PolicyError(f"tensors {sorted(tensors)}, expected {sorted(names)}")
-    weights = tuple(tensors[f"layer{n}.weight"] for n in range(layers))
-    biases = tuple(tensors[f"layer{n}.bias"] for n in range(layers))
-    width: int | None = None
-    for number, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
-        fits = weight.ndim == 2 and bias.shape == weight.shape[:1]
-        if not fits or (width is not None and weight.shape[1] != width):
-            raise PolicyError(
-                f"layer {number}: weight {weight.shape} and bias {bias.shape} do not fit "
-                f"{width} inputs"
-            )
-        width = weight.shape[0]
     activation = data["network"]["activation"]
     if activation not in ("relu", "tanh"):
         raise PolicyError(f"activation {activation!r}, allowed relu, tanh")
@@ -333,7 +322,7 @@ def policy_from(tensors: dict[str, Float32Array], data: dict[str, Any]) -> QPoli
         spec=ObservationSpec.from_json(data["observation"]),
         params=params,
         reward=RewardConfig(**data["reward"]),
-        net=Mlp(weights, biases, activation),
+        net=network_of(tensors, layers, activation),
         scaling=Normalisation(**data["normalisation"]),
         gamma=float(data["gamma"]),
         actions=_count(data, "actions", ACTIONS_MIN, ACTIONS_MAX),

@@ -4,8 +4,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from tractor_ems.policies.mlp import Float32Array, Mlp
-from tractor_ems.policies.policy_file import params_of, write_policy_file
+from tractor_ems.policies.mlp import Float32Array
+from tractor_ems.policies.policy_file import network_of, params_of, write_policy_file
 from tractor_ems.policies.q_policy import Normalisation
 from tractor_ems.policies.run_or_stand import Prices, RunOrStand
 from tractor_msgs_py.errors import PolicyError
@@ -63,7 +63,7 @@ def run_or_stand_from(tensors: dict[str, Float32Array], data: dict[str, Any]) ->
     policy = RunOrStand(
         params=params_of(data),
         spec=ObservationSpec.from_json(data["observation"]),
-        nets=tuple(_net(tensors, n) for n in range(count)),
+        nets=tuple(network_of(tensors, LAYERS, "tanh", f"net{n}.") for n in range(count)),
         scaling=Normalisation(**data["normalisation"]),
         prices=Prices(**data["prices"]),
         horizon_s=float(data["horizon_s"]),
@@ -76,18 +76,3 @@ def run_or_stand_from(tensors: dict[str, Float32Array], data: dict[str, Any]) ->
     if data["name"] != policy.name:
         raise PolicyError(f"name {data['name']!r}, with this horizon_s it is {policy.name}")
     return policy
-
-
-def _net(tensors: dict[str, Float32Array], n: int) -> Mlp:
-    weights = tuple(tensors[f"net{n}.layer{k}.weight"] for k in range(LAYERS))
-    biases = tuple(tensors[f"net{n}.layer{k}.bias"] for k in range(LAYERS))
-    width: int | None = None
-    for k, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
-        fits = weight.ndim == 2 and bias.shape == weight.shape[:1]
-        if not fits or (width is not None and weight.shape[1] != width):
-            raise PolicyError(
-                f"net {n} layer {k}: weight {weight.shape} and bias {bias.shape} do not fit "
-                f"{width} inputs"
-            )
-        width = weight.shape[0]
-    return Mlp(weights, biases, "tanh")
